@@ -35,27 +35,30 @@ DOORS: Final = {
     "afspm.drawing": "pictures, charts and timelines",
     "afspm.report": "reports, comparisons and figures of nights",
     "afspm.scheduler": "coordinate frames, approvals, replays",
-    "afspm.processes": "pages, gateways, bridges, commands",
+    "afspm.components": "components: judges of tips, pairs of channels, plans, files and states that last",
+    "afspm.client": "pages and scripts: connections, measurements and settings as a script makes them",
+    "afspm.cli": "commands",
+    "afspm.experiment": "experiment files",
+    "afspm.supervisor": "runs that are started, rehearsed or resumed",
+    "afspm.storage": "the packet log of a run",
+    "afspm.transport": "bridges and replays: sockets of one side of a run, and the events of the other",
     "afspm.testing": "tests of any of these",
 }
-WHOLE: Final = {"afspm", "afspm.basics", "afspm.model", "afspm.testing"}
+WHOLE: Final = {"afspm", "afspm.components", "afspm.basics", "afspm.model", "afspm.testing"}
 """Doors for authors outside this tree, or with whole families of data and errors: a name may have one user here."""
 MOST_NAMES: Final = 80
-OF_ONE_VERSION: Final = {"afspm-agents", "afspm-lab"}
+OF_ONE_VERSION: Final = {"afspm-agents", "afspm-lab", "afspm-published"}
 """Distributions in packages/ that name the exact version of afspm they are made for, and may import behind doors."""
 PAST_THE_DOORS: Final = {
-    "afspm.model.fencing": "afspm-published",
-    "afspm.model.sessions": "afspm-published web",
-    "afspm.supervisor.process": "afspm-published",
+    "afspm.components.tip_verdict": "line_watch web",
+    "afspm.model.sessions": "web",
     "afspm.supervisor.run_folder": "replay",
-    "afspm.translator.requests": "afspm-published",
     "afspm.transport.process.signals": "replay",
-    "afspm.wire": "afspm-published drift replay web",
-    "afspm.wire.messages": "afspm-published drift line_watch web",
+    "afspm.wire": "drift replay web",
+    "afspm.wire.messages": "drift line_watch web",
 }
 """Modules behind the doors that plug-ins still import, with these plug-ins."""
 NAMES_IN_TESTS: Final = {
-    "afspm-published": 41,  # they stand between whole processes
     "asylum": 2,
     "bluesky": 3,
     "drift": 35,
@@ -122,8 +125,10 @@ def _wrong_tests() -> Iterator[str]:
 
 def _wrong_doors() -> Iterator[str]:
     users: dict[tuple[str, str], set[str]] = defaultdict(set)
-    for plug_in, module, name in _used():
-        users[module, name].add(plug_in)
+    rooms = [(file, file.relative_to(CORE).parts[0]) for file in CORE.rglob("*.py") if file.parent != CORE]
+    for user, module, name in (*_used(), *_imports([room for room in rooms if room[1] != "plugins"])):
+        if not f"{module}.".startswith(f"afspm.{user}."):
+            users[module, name].add(user)
     for door in DOORS:
         names = _names(door)
         if len(names) > MOST_NAMES:
@@ -159,6 +164,8 @@ def _imports(folders: list[tuple[Path, str]]) -> Iterator[tuple[str, str, str]]:
 
 def _target(module: str, name: str) -> str:
     """Return the module that an import of `name` from `module` reaches."""
+    if module in DOORS and name in _names(module):
+        return module
     return f"{module}.{name}" if _file(f"{module}.{name}") else module
 
 

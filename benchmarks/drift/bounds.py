@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from afspm import Array
+from afspm.components import Array
 from benchmarks.drift.conditions import Condition, one_over_f_power
 from benchmarks.drift.pairs import Pair
 from benchmarks.drift.surfaces import rough_power

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from afspm import Array
+from afspm.components import Array
 
 WANDERS = ("steady", "smooth", "swinging")
 """Spectra of lines that wander: of a first-order process, of one smoothed once more, and with a period."""

@@ -13,7 +13,7 @@ from functools import cache
 import numpy as np
 from scipy import ndimage
 
-from afspm import Array
+from afspm.components import Array
 from afspm.model import Region
 from afspm.plugins.drift.registration import DriftScan, Prior
 from afspm.storage.formats import read

@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from afspm import Array
+from afspm.components import Array
 from benchmarks.drift.conditions import CONDITIONS, WANDERS, Condition
 from benchmarks.drift.surfaces import SURFACES, Grid, Random, contaminated
 

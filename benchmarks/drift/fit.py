@@ -24,7 +24,7 @@ from scipy import sparse
 from scipy.optimize import linprog, minimize
 from scipy.stats import beta
 
-from afspm import Array
+from afspm.components import Array
 from afspm.plugins.drift.doubt import acceptance
 from afspm.plugins.drift.doubt.acceptance import MatchEvidence
 from afspm.plugins.drift.doubt.coefficients import SPREAD

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, linalg, ndimage, signal
 
-from afspm import Array
+from afspm.components import Array
 from afspm.model import Region
 from afspm.plugins.drift.registration import DriftScan, Prior
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from afspm import Array
+from afspm.components import Array
 from afspm.model import Region
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 from afspm.plugins.drift.track.shear import row_delay_s

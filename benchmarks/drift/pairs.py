@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy import ndimage
 
-from afspm import Array
+from afspm.components import Array
 from afspm.model import Region
 from afspm.plugins.drift.registration import DriftScan, Prior
 from benchmarks.drift.conditions import CONDITIONS, Condition, measured, wandered

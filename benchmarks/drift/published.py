@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from afspm import Array
+from afspm.components import Array
 from afspm.plugins.drift.pairs.overlap import overlap_center_m
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 from afspm.plugins.drift.registration.keypoints import Descriptors, matched

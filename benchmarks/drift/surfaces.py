@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft, ndimage
 
-from afspm import Array
+from afspm.components import Array
 
 Random = np.random.Generator
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from afspm import Array
+from afspm.components import Array
 from afspm.plugins.drift.estimators import unguarded
 from afspm.plugins.drift.registration import Registration
 from benchmarks.drift import cuts

@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from afspm import Array
+from afspm.components import Array
 from afspm.model import Feedback, Region
 from afspm.plugins.line_watch.line_judge import AlarmLevel, Kind, LineJudge, ScanJudge
 from afspm.plugins.line_watch.registration import levelled

@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 from scipy import ndimage, spatial
 
-from afspm import Array
+from afspm.components import Array
 from afspm.model import Region
 from afspm.plugins.line_watch.line_judge import AlarmLevel, Kind, LineJudge
 from afspm.plugins.line_watch.registration import levelled

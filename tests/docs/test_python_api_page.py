@@ -18,7 +18,7 @@ ENTRY = re.compile(r"^- ((?:`[^`:]*`, )*`[^`:]*`): ", re.MULTILINE)
 LIBRARY_CALLS = {"run_process", "give_back_inherited"}
 
 
-@pytest.mark.parametrize("name", afspm.USERS_NAMES)
+@pytest.mark.parametrize("name", afspm.__all__)
 def test_every_public_name_has_an_entry(name: str) -> None:
     assert f"\n### {name}\n\n`afspm.{name}`\n" in PAGE
 

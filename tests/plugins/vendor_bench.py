@@ -36,8 +36,8 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
-from afspm.processes import FreePorts
 from afspm.simulation.faults import Fault
+from afspm.supervisor import FreePorts
 
 PATIENT: Mapping[str, Any] = {"reply_timeout_s": 120.0}
 """As long as a controller on a busy computer may need to answer."""

@@ -81,7 +81,7 @@ if TYPE_CHECKING:  # a page shows times in the zone of who reads it, and one lin
 if TYPE_CHECKING:  # a plug-in of its own extras: imports by name, and a missing package
     from afspm.basics.entry_points import load as load_plugin
     from afspm.basics.entry_points import names as plugin_names
-    from afspm.basics.named_imports import import_named, require_trusted, trusting_only
+    from afspm.basics.named_imports import import_named, require_trusted
     from afspm.basics.requirements import imports_of_extra
 
 __all__ = [
@@ -150,7 +150,6 @@ __all__ = [
     "si",
     "si_or_text",
     "time_of_day",
-    "trusting_only",
     "typeset",
     "typeset_area",
     "typeset_length",
@@ -167,27 +166,28 @@ if not TYPE_CHECKING:
             "afspm.basics.addresses": "Listens is_address",
             "afspm.basics.clock": "NS_PER_S Clock ExperimentClock NeverLate iso_utc utc_time",
             "afspm.basics.errors": (
-                "AfspmError ConfigError ControlLost ExperimentEnded FileError InvalidValue MeasurementFailed "
-                "NoResponse NoSuchItem Refused RequestError TransportError UnitError WireError"
+                "AfspmError ConfigError ControlLost ExperimentEnded FileError InvalidValue "
+                "MeasurementFailed NoResponse NoSuchItem Refused RequestError TransportError UnitError "
+                "WireError"
             ),
             "afspm.basics.exit_codes": "ExitCode",
             "afspm.basics.formatting": (
-                "area_text counted day_and_time duration_text escaped lengths_text position_text quantity scale "
-                "shortest_single typeset_position time_of_day typeset typeset_area typeset_length zone_offset_s "
-                "zone_offsets_s"
+                "area_text counted day_and_time duration_text escaped lengths_text position_text quantity "
+                "scale shortest_single typeset_position time_of_day typeset typeset_area typeset_length "
+                "zone_offset_s zone_offsets_s"
             ),
             "afspm.basics.frozen": "replace",
             "afspm.basics.interpreter": "python_command python_environment",
             "afspm.basics.launch": "Launch Sockets",
-            "afspm.basics.named_imports": "import_named require_trusted trusting_only",
+            "afspm.basics.named_imports": "import_named require_trusted",
             "afspm.basics.plain_data": "Count Plain PlainList PlainMapping from_json",
             "afspm.basics.progress_line": "ProgressLine",
             "afspm.basics.requirements": "require imports_of_extra",
             "afspm.basics.shared_time": "Publication",
             "afspm.basics.toml": "parse_toml",
             "afspm.basics.units": (
-                "Angle Current Duration Length PollPeriod PositiveLength Speed Voltage convert parse_quantity "
-                "same_kind si si_or_text"
+                "Angle Current Duration Length PollPeriod PositiveLength Speed Voltage convert "
+                "parse_quantity same_kind si si_or_text"
             ),
         },
         load_plugin="afspm.basics.entry_points.load",

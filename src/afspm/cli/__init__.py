@@ -4,6 +4,43 @@ from __future__ import annotations
 
 import io
 import sys
+from typing import TYPE_CHECKING
+
+from afspm.basics.lazy import lazily
+
+if TYPE_CHECKING:
+    from afspm.cli.arguments import AFTERWARDS, MEANWHILE, RUNS, NoProgress, Where, names_in, opt
+    from afspm.cli.joining import looking, plain_console, plain_table
+
+if TYPE_CHECKING:  # one command has it, and another may
+    from afspm.cli.arguments import HelpWhenBare, RecordedRun
+    from afspm.cli.declared_commands import DeclaredCommands
+
+__all__ = [
+    "AFTERWARDS",
+    "MEANWHILE",
+    "RUNS",
+    "DeclaredCommands",
+    "HelpWhenBare",
+    "NoProgress",
+    "RecordedRun",
+    "Where",
+    "looking",
+    "names_in",
+    "opt",
+    "plain_console",
+    "plain_table",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazily(
+        __name__,
+        {
+            "afspm.cli.arguments": "AFTERWARDS MEANWHILE RUNS NoProgress Where names_in opt HelpWhenBare RecordedRun",
+            "afspm.cli.declared_commands": "DeclaredCommands",
+            "afspm.cli.joining": "looking plain_console plain_table",
+        },
+    )
 
 
 def main() -> None:

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from afspm.cli.examination import Examination
+    from afspm.components import PlannedWork
     from afspm.components.notifications import Notification, Targets, Way
     from afspm.experiment import Experiment, Finding
-    from afspm.model.planned_work import PlannedWork
 
 
 def check(

@@ -14,7 +14,7 @@ from afspm.client.experiment_link import ExperimentLink
 from afspm.model import Packet, ProblemNames
 from afspm.night import Overview
 from afspm.record import cut_off_message
-from afspm.supervisor.own_runs import register_own_messages
+from afspm.supervisor import register_own_messages
 from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import open_port
 from afspm.wire.messages import SCAN_LINES

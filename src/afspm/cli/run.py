@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from afspm.basics.plain_data import PlainMapping
     from afspm.experiment import Experiment, ProcessStart
     from afspm.experiment.resolved_experiment import ResolvedExperiment
-    from afspm.supervisor.resume import ResumableRun
+    from afspm.supervisor import ResumableRun
     from afspm.supervisor.run import FinishedRun
 
 _QUESTIONS: Final = {

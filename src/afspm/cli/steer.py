@@ -128,7 +128,7 @@ def note(
     from afspm.basics.clock import ExperimentClock
     from afspm.cli.joining import acting, person
     from afspm.client.connect import find_one_run
-    from afspm.night.notes import append_note
+    from afspm.components import append_note
     from afspm.night.run import open_run
     from afspm.record import goes_on
     from afspm.report import REPORT_FILE

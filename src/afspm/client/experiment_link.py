@@ -40,6 +40,7 @@ from afspm.model import (
 from afspm.model.requests import OTHER_RUN_RESPONSE
 from afspm.model.sessions import run_of
 from afspm.model.state import FeedbackUnits
+from afspm.transport import Port
 from afspm.transport.port import (
     CaughtUp,
     ControlConnected,
@@ -48,7 +49,6 @@ from afspm.transport.port import (
     Killed,
     PacketReceived,
     ParentGone,
-    Port,
     ReplyReceived,
 )
 from afspm.transport.process.context import ProcessActivity

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from afspm.basics.errors import Interrupted
-from afspm.transport.port import Port
+from afspm.transport import Port
 from afspm.transport.process import signals
 
 

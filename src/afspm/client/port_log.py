@@ -32,7 +32,8 @@ from afspm.basics.plain_data import Plain
 from afspm.client.keyed_results import kept_in
 from afspm.model import Packet
 from afspm.storage.line_log import REQUESTS_FOLDER, LineLog
-from afspm.transport.port import CaughtUp, Incoming, PacketReceived, Port, ReplyReceived
+from afspm.transport import Port
+from afspm.transport.port import CaughtUp, Incoming, PacketReceived, ReplyReceived
 from afspm.transport.process.context import ProcessContext
 
 INLINE_BYTES = 4096

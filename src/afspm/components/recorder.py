@@ -13,10 +13,11 @@ from afspm.basics.toml import parse_toml
 from afspm.client.component import Component
 from afspm.model import Frame, ProblemNames, ProcessStates
 from afspm.record.run_json import EXPERIMENT_FILE, METADATA, experiment_name, run_json_or_empty
-from afspm.storage.packet_log import LogReader, commit, committed, log_folder
+from afspm.storage import log_folder
+from afspm.storage.packet_log import LogReader, commit, committed
 from afspm.storage.segment import segments
+from afspm.transport import step_back
 from afspm.transport.port import Killed, PacketReceived, ParentGone
-from afspm.transport.process.context import step_back
 
 if TYPE_CHECKING:
     from afspm.basics.clock import Clock

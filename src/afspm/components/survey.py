@@ -13,10 +13,10 @@ from afspm.basics import Angle
 from afspm.basics.errors import ConfigError, Refused
 from afspm.basics.formatting import area_text, counted, lengths_text, position_text
 from afspm.basics.units import Length
+from afspm.client import xy_of
 from afspm.client.component import Component
 from afspm.client.events import Events
 from afspm.client.keyed_results import check_key
-from afspm.client.targets import xy_of
 from afspm.components.pace import Pace
 from afspm.components.planned_scans import FRAME, Pixels, checked_parameters, pair, shape_of, speed_in_force
 from afspm.components.scan_plan import ScanPlan
@@ -37,7 +37,7 @@ from afspm.model.geometry import XY
 from afspm.model.planned_work import PlannedWork, planned_rounds
 from afspm.record import drift_knowledge
 from afspm.storage.atomic import OutageLog
-from afspm.transport.process.loading import find_object
+from afspm.transport import find_object
 
 MAPPING = "DriftMapping"
 LEAST_ZOOM_PX = 20

@@ -17,9 +17,45 @@
     always holds  all findings are reported at once; an experiment with an error never starts
 """
 
-from afspm.experiment.experiment import Experiment, load, load_expanded
-from afspm.experiment.findings import Finding, Level, SourceLocation
-from afspm.experiment.process_starts import ProcessStart
-from afspm.model import Role
+from __future__ import annotations
 
-__all__ = ["Experiment", "Finding", "Level", "ProcessStart", "Role", "SourceLocation", "load", "load_expanded"]
+from typing import TYPE_CHECKING
+
+from afspm.basics.lazy import lazily
+
+if TYPE_CHECKING:
+    from afspm.experiment.class_loader import importing_from
+    from afspm.experiment.experiment import Experiment, load
+    from afspm.experiment.process_starts import ProcessStart
+    from afspm.experiment.toml_writer import dumps as toml_text
+    from afspm.model import Role
+
+if TYPE_CHECKING:  # one page or command has it, and another may
+    from afspm.experiment.experiment import load_expanded
+    from afspm.experiment.findings import Finding
+    from afspm.experiment.process_starts import DASHBOARD
+
+__all__ = [
+    "DASHBOARD",
+    "Experiment",
+    "Finding",
+    "ProcessStart",
+    "Role",
+    "importing_from",
+    "load",
+    "load_expanded",
+    "toml_text",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazily(
+        __name__,
+        {
+            "afspm.experiment.class_loader": "importing_from",
+            "afspm.experiment.experiment": "Experiment load load_expanded",
+            "afspm.experiment.findings": "Finding",
+            "afspm.experiment.process_starts": "ProcessStart DASHBOARD",
+            "afspm.model": "Role",
+        },
+        toml_text="afspm.experiment.toml_writer.dumps",
+    )

@@ -27,7 +27,16 @@ from afspm.experiment.toml_lines import Table
 from afspm.model import Role
 
 _OTHER_MAKE = "is it written for the published implementation? see docs/how-to/from-the-published-implementation.md"
-_DOORS = ("afspm", "afspm.basics", "afspm.model", "afspm.driver", "afspm.emulation", "afspm.record", "afspm.processes")
+_DOORS = (
+    "afspm",
+    "afspm.basics",
+    "afspm.model",
+    "afspm.driver",
+    "afspm.emulation",
+    "afspm.record",
+    "afspm.components",
+    "afspm.client",
+)
 # Roles by the package of a base class: a user's class is recognised by its bases.
 _ROLE_BY_BASE = (
     ("afspm.scheduler", Role.SCHEDULER),

@@ -24,8 +24,8 @@ from afspm.experiment.toml_writer import to_toml
 from afspm.model import Role, names
 
 if TYPE_CHECKING:
+    from afspm.components import PlannedWork
     from afspm.experiment.resolved_experiment import ResolvedExperiment
-    from afspm.model.planned_work import PlannedWork
 
 
 class Experiment:

@@ -13,6 +13,7 @@ from afspm.basics.errors import AfspmError, UnitError
 from afspm.basics.formatting import duration_text, lengths_text, quantity
 from afspm.basics.units import convert, si
 from afspm.client.parameter_text import to_parameter
+from afspm.components import PlannedWork
 from afspm.experiment.toml_lines import Table
 from afspm.model import (
     ControlRequest,
@@ -25,7 +26,7 @@ from afspm.model import (
     names,
 )
 from afspm.model.geometry import XY
-from afspm.model.planned_work import PlannedWork, path_length_m
+from afspm.model.planned_work import path_length_m
 from afspm.model.sweep_plan import SweepPlan
 from afspm.scheduler import ExperimentLimits
 from afspm.scheduler.safety.forbidden_states import PlanRehearsal

@@ -23,7 +23,7 @@ from afspm.experiment.toml_lines import Settings
 from afspm.experiment.wiring_classes import WIRE_SETTINGS, BoundSocket, wire_of
 from afspm.model import Role, component_of, is_of_instrument, names
 from afspm.model.events import LONGEST_PROCESS_NAME, PERSON, is_process_name
-from afspm.transport.network import is_local
+from afspm.transport import is_local
 from afspm.wire.messages import CONDITIONS, SCAN_LINES
 
 OPENS_PLAIN: Final = "opens_plain"

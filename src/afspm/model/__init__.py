@@ -183,8 +183,8 @@ if not TYPE_CHECKING:
                 "HEIGHT HEIGHT_RETRACE RETRACE TOPOGRAPHY ChannelName ChannelRoles both_ways of_role"
             ),
             "afspm.model.events": (
-                "LONGEST_NOTE PERSON ControlEvent JournalEntries JournalEntry LogLine Note ProcessCondition "
-                "ProcessState ProcessStates Progress RelayedMessage Role component_of"
+                "LONGEST_NOTE PERSON ControlEvent JournalEntries JournalEntry LogLine Note "
+                "ProcessCondition ProcessState ProcessStates Progress RelayedMessage Role component_of"
             ),
             "afspm.model.geometry": "XY Frame Region RegionChange",
             "afspm.model.grants": "Approval Approvals Grant GrantedCount GrantedRange GrantedStep Proposal",
@@ -196,9 +196,9 @@ if not TYPE_CHECKING:
             "afspm.model.problems": "STOPPED_BY_AGENT Problem ProblemNames",
             "afspm.model.registration_outcome": "RegistrationOutcome registration_summary",
             "afspm.model.requests": (
-                "CLOCK_REQUEST GRANT_REQUEST HAS_ENDED LEASE_AT_ONCE_S LEASE_REQUEST RELAY_REQUEST RESTART_REQUEST "
-                "WAIT_FOR_CONTROL ControlRequest ControlResponse Parameter Request RescanKind Response "
-                "ResponseDetail request_name"
+                "CLOCK_REQUEST GRANT_REQUEST HAS_ENDED LEASE_AT_ONCE_S LEASE_REQUEST RELAY_REQUEST "
+                "RESTART_REQUEST WAIT_FOR_CONTROL ControlRequest ControlResponse Parameter Request "
+                "RescanKind Response ResponseDetail request_name"
             ),
             "afspm.model.scan": "Scan ScanLines ScanParameters ScanSet",
             "afspm.model.scan_history": "ScanHistory",

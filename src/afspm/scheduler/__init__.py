@@ -41,9 +41,7 @@ if TYPE_CHECKING:  # a coordinate frame is asked about every event, and answers 
     from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, scan_values
     from afspm.scheduler.control.arbitration import ArbitrationState
     from afspm.scheduler.coordinate_frame import (
-        TIP_FRAME,
         AskMicroscope,
-        CoordinateFrame,
         FrameOutput,
         HoldControl,
         MappedRequest,
@@ -81,13 +79,11 @@ if TYPE_CHECKING:  # a replay gives a scheduler its recorded steps
 __all__ = [
     "PROBE_CHANGES",
     "REGION_CHANGES",
-    "TIP_FRAME",
     "Announced",
     "ArbitrationState",
     "AskMicroscope",
     "Codec",
     "ControlChanged",
-    "CoordinateFrame",
     "Coordinates",
     "Delegate",
     "ExperimentLimits",
@@ -124,7 +120,7 @@ if not TYPE_CHECKING:
             "afspm.model.positions": "PROBE_CHANGES REGION_CHANGES scan_values",
             "afspm.scheduler.control.arbitration": "ArbitrationState",
             "afspm.scheduler.coordinate_frame": (
-                "TIP_FRAME AskMicroscope CoordinateFrame FrameOutput HoldControl MappedRequest Reconsider SaveNow"
+                "AskMicroscope FrameOutput HoldControl MappedRequest Reconsider SaveNow"
             ),
             "afspm.scheduler.events": (
                 "Announced Codec ControlChanged Delegate FrameAnswered FrameReported Input Log PacketIn "

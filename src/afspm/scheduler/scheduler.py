@@ -81,8 +81,9 @@ class Scheduler:
         from afspm.scheduler.step_log import RecordedCore, StepLog
         from afspm.scheduler.wire_codec import WireCodec
         from afspm.scheduler.write_ahead import StateFile, WriteAhead
-        from afspm.storage.packet_log import PacketLog, log_folder
-        from afspm.transport.polling import milliseconds
+        from afspm.storage import log_folder
+        from afspm.storage.packet_log import PacketLog
+        from afspm.transport import milliseconds
         from afspm.transport.rate_limited_log import RateLimitedLog
         from afspm.transport.scheduler_sockets import SchedulerSockets
 

@@ -13,3 +13,25 @@ resume are derived from that log, so they can't contradict each other.
 `formats/` reads and writes file formats that no single maker owns. Readers of a maker's own formats are in its
 plug-in, the reader of the record's own files in `record`.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from afspm.basics.lazy import lazily
+
+if TYPE_CHECKING:
+    from afspm.storage.packet_log import log_folder, logged_packets
+
+__all__ = [
+    "log_folder",
+    "logged_packets",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazily(
+        __name__,
+        {
+            "afspm.storage.packet_log": "log_folder logged_packets",
+        },
+    )

@@ -11,3 +11,43 @@ loop around them (`supervisor`) waits in one poller for heartbeats, exits, outpu
                   computer slept (`supervision/liveness`); no child outlives its supervisor (`reaper`); the microscope
                   is left safe
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from afspm.basics.lazy import lazily
+
+if TYPE_CHECKING:
+    from afspm.supervisor.own_runs import register_own_messages
+    from afspm.supervisor.ports import FreePorts
+    from afspm.supervisor.resume import ResumableRun
+    from afspm.supervisor.run import RunOptions
+    from afspm.supervisor.run import run as run_experiment
+
+if TYPE_CHECKING:  # a page rehearses runs, a replay says when it is
+    from afspm.supervisor.run import dry_run
+    from afspm.supervisor.run import now as run_time
+
+__all__ = [
+    "FreePorts",
+    "ResumableRun",
+    "RunOptions",
+    "dry_run",
+    "register_own_messages",
+    "run_experiment",
+    "run_time",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazily(
+        __name__,
+        {
+            "afspm.supervisor.own_runs": "register_own_messages",
+            "afspm.supervisor.ports": "FreePorts",
+            "afspm.supervisor.resume": "ResumableRun",
+            "afspm.supervisor.run": "RunOptions dry_run",
+        },
+        run_experiment="afspm.supervisor.run.run",
+        run_time="afspm.supervisor.run.now",
+    )

@@ -15,12 +15,8 @@ import sys
 import threading
 
 from afspm.basics.exit_codes import ExitCode
-from afspm.transport.process.parent import (
-    call_at_signal,
-    end_within,
-    leave_interrupts_to_parent,
-    take_standard_input,
-)
+from afspm.transport import leave_interrupts_to_parent
+from afspm.transport.process.parent import call_at_signal, end_within, take_standard_input
 
 ASK_S = 0.6  # from the end of standard input to SIGTERM
 TERMINATE_S = 0.4  # from SIGTERM to SIGKILL

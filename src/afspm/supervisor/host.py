@@ -8,12 +8,8 @@ from __future__ import annotations
 
 import sys
 
-from afspm.transport.process.parent import (
-    end_within,
-    leave_interrupts_to_parent,
-    read_launch_line,
-    take_standard_input,
-)
+from afspm.transport import leave_interrupts_to_parent
+from afspm.transport.process.parent import end_within, read_launch_line, take_standard_input
 
 EXIT_GRACE_S = 1.0  # for exit handlers and threads of libraries
 

@@ -14,9 +14,10 @@ from afspm.basics.clock import Clock, ExperimentClock
 from afspm.basics.errors import ConfigError
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.launch import Launch
+from afspm.transport import Port
 from afspm.transport.heartbeat import HeartbeatSender
 from afspm.transport.network import Network
-from afspm.transport.port import ParentGone, Port
+from afspm.transport.port import ParentGone
 from afspm.transport.process import failure, log
 from afspm.transport.process.context import (
     DEFAULT_LONGEST_STEP_S,

@@ -45,9 +45,10 @@ from afspm.supervisor.supervision.supervisor_events import (
     SchedulerAnswered,
     UseReported,
 )
+from afspm.transport import ZmqPort
 from afspm.transport.port import ControlConnected, ControlDisconnected, Incoming, ReplyReceived
 from afspm.transport.process.context import new_session
-from afspm.transport.zmq_port import ZmqPort, open_port
+from afspm.transport.zmq_port import open_port
 
 STATES_PERIOD_S = 2.0
 """Longest real time between two reports of all states."""

@@ -23,8 +23,8 @@ from afspm.record import REPLAY_OF, lock_run, read_run_json
 from afspm.record.journal import open_to_read
 from afspm.record.run_json import EXPERIMENT_FILE, STATE_DIR
 from afspm.record.run_lock import quoted, resume_command
+from afspm.storage import log_folder, logged_packets
 from afspm.storage.atomic import load_checkpoint
-from afspm.storage.packet_log import log_folder, logged_packets
 from afspm.supervisor import run as running
 from afspm.supervisor.own_runs import HOMES
 from afspm.supervisor.ports import require_free, require_limits

@@ -17,7 +17,8 @@ from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import AfspmError, ConfigError
 from afspm.basics.formatting import counted, duration_text
 from afspm.basics.launch import Launch, Sockets
-from afspm.client.connect import GUEST, guest_facts
+from afspm.client import GUEST
+from afspm.client.connect import guest_facts
 from afspm.experiment import Experiment, ProcessStart, Role
 from afspm.model.events import LOGGED_AS
 from afspm.record import lock_run
@@ -37,8 +38,9 @@ from afspm.record.run_json import (
     run_json_or_empty,
 )
 from afspm.record.run_lock import writing_to
+from afspm.storage import log_folder
 from afspm.storage.disk import run_bounded
-from afspm.storage.packet_log import discard_if_recorded, expect_recorder, log_folder
+from afspm.storage.packet_log import discard_if_recorded, expect_recorder
 from afspm.supervisor import key_handout, own_runs, post_run, run_folder, run_identity
 from afspm.supervisor.log import RunLog
 from afspm.supervisor.ports import FreePorts, new_addresses, require_free, require_limits

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from afspm.processes import FreePorts
+from afspm.supervisor import FreePorts
 from afspm_bench.trial import TrialFailed, await_listener
 
 

@@ -15,7 +15,7 @@ import pytest
 from deadlines import DEADLINE_S
 
 from afspm.basics import FileError
-from afspm.processes import FreePorts
+from afspm.supervisor import FreePorts
 from afspm_bench.cassette import (
     IdTranslation,
     ToolCall,

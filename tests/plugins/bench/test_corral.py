@@ -16,7 +16,7 @@ from deadlines import DEADLINE_S
 from afspm import Scope
 from afspm.basics import ExperimentClock, InvalidValue
 from afspm.model import Region, Scan, ScanSet
-from afspm.processes import FreePorts
+from afspm.supervisor import FreePorts
 from afspm_bench.corral import CorralEnvironment
 from afspm_bench.session import TrialSession
 

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from afspm import restored, snapshot, wire
+from afspm import wire
+from afspm.components import restored, snapshot
 from afspm.model import (
     ControlRequest,
     ControlResponse,

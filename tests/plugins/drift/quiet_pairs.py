@@ -10,7 +10,7 @@ import pytest
 from benchmarks.drift import cuts, families
 from scipy import ndimage
 
-from afspm import Array
+from afspm.components import Array
 from afspm.plugins.drift.registration import DriftScan
 
 QUIET: dict[str, Any] = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from afspm import Array
+from afspm.components import Array
 from afspm.model import Region
 from afspm.plugins.drift.registration import DriftScan
 

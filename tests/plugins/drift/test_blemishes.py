@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from benchmarks.drift.foreign_pairs import PIXEL_M, foreign_pair
 
-from afspm import Array
+from afspm.components import Array
 from afspm.plugins.drift.doubt.coefficients import DOUBT, SPREAD
 from afspm.plugins.drift.doubt.covariance import Doubt
 from afspm.plugins.drift.estimators.least_squares import LeastSquares

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.plugins.drift.trackers_lab import FRAME_S, SIZE_M, scan_at
 
-from afspm import Array
+from afspm.components import Array
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 from afspm.plugins.drift.track import BankTracker
 from afspm.plugins.drift.track.shear import (

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from benchmarks.drift.pairs import PIXEL_M, Pair, pair
 
-from afspm import Array
+from afspm.components import Array
 from afspm.plugins.drift.estimators.least_squares import LeastSquares
 from afspm.plugins.drift.pairs.images import Image, prepare
 from afspm.plugins.drift.pairs.spikes import without_spikes

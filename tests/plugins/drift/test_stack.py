@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from afspm import Array
 from afspm.basics import InvalidValue
+from afspm.components import Array
 from afspm.model import Frame, Region
 from afspm.plugins.drift.registration import DriftScan
 from afspm.plugins.drift.track.offline import corrected

@@ -20,8 +20,8 @@ from tests.plugins.drift.trackers_lab import (
     walked,
 )
 
-from afspm import Array
 from afspm.basics import ConfigError, InvalidValue
+from afspm.components import Array
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 from afspm.plugins.drift.track import BankTracker, PaperTracker, forecast_from_dict, tracker
 from afspm.plugins.drift.track.tracking import Prediction, Update

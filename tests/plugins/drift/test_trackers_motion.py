@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from afspm import from_plain, to_plain
+from afspm.components import from_plain, to_plain
 from afspm.plugins.drift.track.filters import Models
 from afspm.plugins.drift.track.forecast import Compensation
 

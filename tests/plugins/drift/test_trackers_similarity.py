@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from tests.plugins.drift.registering import PIXEL_M, Waves
 from tests.plugins.drift.trackers_lab import World, follow
 
-from afspm import Array
 from afspm.basics import ConfigError, InvalidValue
+from afspm.components import Array
 from afspm.model import Frame, Region
 from afspm.plugins.drift.estimators.least_squares import LeastSquares
 from afspm.plugins.drift.frame.worker_state import WorkerStateFile

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from afspm import Array
+from afspm.components import Array
 from afspm.model import Region
 from afspm.plugins.drift.pairs.overlap import intersection_ratio, overlap_center_m
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration

@@ -23,7 +23,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
-from afspm.processes import FreePorts
+from afspm.supervisor import FreePorts
 
 Make = Callable[..., Bench]
 FREE = ScopeState.FREE

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from afspm import Levelling
 from afspm.basics import InvalidValue
+from afspm.components import Levelling
 from afspm.model import Region
 from afspm.plugins.web.dashboard.night_page import difference
 from afspm.plugins.web.frames import ChannelFrame

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from afspm import PlannedWork, wire
+from afspm import wire
 from afspm.basics import ExperimentClock, time_of_day, typeset_position, zone_offset_s
+from afspm.components import PlannedWork
 from afspm.drawing import timeline_html
 from afspm.model import (
     ControlMode,

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from afspm import Levelling
+from afspm.components import Levelling
 from afspm.model import ChannelRoles, Region, Scan, ScanLines
 from afspm.plugins.web.dashboard.pictures import Look, PictureCache
 from afspm.plugins.web.frames import MEMORY_BYTES, MOST_CHANNELS, FrameStore

@@ -9,8 +9,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from afspm import BEGUN_WITHIN_S, ScanTarget
 from afspm.basics import ExperimentClock
+from afspm.client import BEGUN_WITHIN_S, ScanTarget
 from afspm.model import ControlResponse, Frame, Region, Response, Scan, ScopeState, ScopeStatus
 from afspm.plugins.web.gateway.measurements import Measurement, Measurements
 from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest

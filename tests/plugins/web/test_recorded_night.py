@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from afspm import append_note, open_run, wire
+from afspm import open_run, wire
+from afspm.components import append_note
 from afspm.model import (
     ControlMode,
     ControlState,

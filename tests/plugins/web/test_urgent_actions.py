@@ -9,11 +9,11 @@ import pytest
 from deadlines import DEADLINE_S
 
 from afspm.basics import ExperimentClock, Launch
+from afspm.client import ExperimentLink
 from afspm.model import ControlResponse, Region, Response, ScanParameters, ScopeState, ScopeStatus, names
 from afspm.plugins.web.person_commands import PersonCommands
 from afspm.plugins.web.persons import Persons
 from afspm.plugins.web.watch import Watch
-from afspm.processes import ExperimentLink
 
 
 class BusyMicroscope:

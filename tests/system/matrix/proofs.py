@@ -23,8 +23,8 @@ import pytest
 from tests.system.matrix.true_scans import SimulatedTruth, TrueScan, Truth, truth_of
 
 import afspm
-from afspm import Levelling, levelled
 from afspm.basics.units import convert, si_unit
+from afspm.components import Levelling, levelled
 from afspm.model import Problem, ScanSet, names
 from afspm.model.arrays import Array
 from afspm.night.run import Run

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from unittest import mock
 
-from afspm.processes import ProcessContext
 from afspm.scheduler import Scheduler
 from afspm.scheduler.control import lifecycle
+from afspm.transport import ProcessContext
 
 STAYS_S = 3600.0
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from afspm.basics import parse_toml
+from afspm.cli import MEANWHILE, RUNS, Where, looking
 from afspm.cli.joining import acting
-from afspm.processes import MEANWHILE, RUNS, Where, looking
 
 if TYPE_CHECKING:
     from afspm.model import Grant, Proposal
@@ -97,8 +97,8 @@ def grant_lines(grant: Grant) -> list[str]:
 def _approve(where: Path, proposal: Proposal, *, yes: bool) -> None:
     import asyncio
 
-    from afspm import find_run
     from afspm.basics import AfspmError, escaped
+    from afspm.client import find_run
     from afspm.model import Frame, names
     from afspm_agents.approval import of_plan, summary
     from afspm_agents.simulated_run import repeated

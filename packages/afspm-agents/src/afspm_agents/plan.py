@@ -8,8 +8,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from afspm import ScanTarget, SpectrumTarget, to_parameter
 from afspm.basics import AfspmError, InvalidValue, area_text, convert, from_json, parse_quantity, position_text, si
+from afspm.client import ScanTarget, SpectrumTarget, to_parameter
 from afspm.model import XY, ControlRequest, Frame, GrantedStep, Parameter, ProbePosition, Region, names
 from afspm.wire import encode_subject
 

@@ -16,8 +16,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from afspm import Array, robust_spread
 from afspm.basics import AfspmError, Plain
+from afspm.components import Array, robust_spread
 from afspm.model import Frame, ProblemNames
 from afspm.night import ScanSummary
 from afspm.plugins.web.archive import Archive

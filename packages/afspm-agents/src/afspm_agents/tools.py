@@ -21,8 +21,8 @@ from mcp import types
 from mcp.server.lowlevel import Server
 from numpy.typing import NDArray
 
-from afspm import Levelling, levelled
 from afspm.basics import AfspmError, Plain, escaped, iso_utc, parse_toml
+from afspm.components import Levelling, levelled
 from afspm.drawing import indices, png, value_range
 from afspm.model import ControlMode, ControlResponse, ControlState, Proposal, names
 from afspm.night import ScanSummary

@@ -19,12 +19,12 @@ from pathlib import Path
 
 import numpy as np
 
-from afspm import Levelling, levelled
 from afspm.basics import AfspmError, Plain
+from afspm.components import Levelling, levelled
 from afspm.drawing import indices, png, value_range
 from afspm.emulation import ScanActivity, SimulatedInstrument
+from afspm.experiment.experiment import load_expanded
 from afspm.model import Frame, Request, component_of, names
-from afspm.processes import load_expanded
 from afspm.record import EXPERIMENT_FILE
 from afspm.scheduler import ExperimentLimits, number_of
 from afspm.scheduler.safety.forbidden_states import PlanRehearsal

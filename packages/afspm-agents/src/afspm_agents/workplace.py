@@ -11,8 +11,9 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from afspm import Memory, Target, wire
+from afspm import Memory, wire
 from afspm.basics import Plain
+from afspm.client import Target
 from afspm.model import (
     LEASE_AT_ONCE_S,
     RELAY_REQUEST,
@@ -35,7 +36,7 @@ from afspm.plugins.web.gateway.models import MeasurementState
 from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest, of_error, refused
 from afspm.plugins.web.person_commands import PersonCommands
 from afspm.plugins.web.watch import Bell, Watch
-from afspm.processes import StopRequested
+from afspm.transport import StopRequested
 from afspm_agents.plan import MoveStep, Plan, ScanStep, SetStep, SpectrumStep, Step, plan_of
 
 LEASE_S = 30.0

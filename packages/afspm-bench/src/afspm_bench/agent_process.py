@@ -16,8 +16,9 @@ from typing import Final, TextIO
 
 from afspm import Scope
 from afspm.basics import Clock, ConfigError, ExperimentClock, ExperimentEnded, Launch, NoResponse, Plain
+from afspm.client import ExperimentLink
 from afspm.model import Frame, ProblemNames
-from afspm.processes import ExperimentLink, new_session, open_port
+from afspm.transport import new_session, open_port
 from afspm_bench.kept_clock import KeptClock
 from afspm_bench.session import BenchAgent, TrialSession
 

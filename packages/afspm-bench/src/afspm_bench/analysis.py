@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from afspm import Array
+from afspm.components import Array
 from afspm.model import Region, Scan, Spectrum
 
 XY = tuple[float, float]

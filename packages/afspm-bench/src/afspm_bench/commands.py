@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from afspm.processes import HelpWhenBare
+from afspm.cli import HelpWhenBare
 
 app = typer.Typer(
     cls=HelpWhenBare,

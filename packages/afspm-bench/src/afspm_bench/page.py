@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Final
 
-from afspm import replace_file
+from afspm.components import replace_file
 from afspm.report import document, section
 from afspm.report import table as html_table
 from afspm_bench.agents import HOME

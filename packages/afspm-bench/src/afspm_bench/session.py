@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from afspm import Scope, write_atomic
+from afspm import Scope
 from afspm.basics import Clock, PlainMapping
+from afspm.components import write_atomic
 from afspm.emulation import World
 from afspm_bench.evidence import Report
 

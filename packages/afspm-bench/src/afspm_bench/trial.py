@@ -21,11 +21,13 @@ from typing import IO, Final
 from urllib.parse import urlsplit
 
 import afspm
-from afspm import Scope, guest_of
+from afspm import Scope
 from afspm.basics import AfspmError, ExperimentClock, NoResponse, PlainMapping, python_command, python_environment
+from afspm.client import guest_of
+from afspm.experiment import toml_text
 from afspm.model import ControlMode, ScopeState, names
-from afspm.processes import FreePorts, toml_text
 from afspm.record import latest_run
+from afspm.supervisor import FreePorts
 from afspm_bench.agent_files import AgentFiles
 from afspm_bench.agent_folder import MOST_BYTES, remove, require_bounds, watched
 from afspm_bench.cassette import REPORT_CALL, ToolCall, recording

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import afspm
-from afspm import write_atomic
 from afspm.basics import ConfigError, Refused, Speed
+from afspm.components import write_atomic
 from afspm.driver import FRAME, Driver, FileFacts, SettingsGroup, Value, action, encode_scan, frame, frame_values
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
 

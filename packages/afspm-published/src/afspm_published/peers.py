@@ -14,33 +14,20 @@ import zmq
 from afspm import wire
 from afspm.basics import ConfigError, ExitCode, Launch, WireError
 from afspm.model import PERSON, ControlRequest, ControlResponse, Packet, Response, ScopeState
-from afspm.processes import (
-    ACCEPTED,
-    DISCONNECTED,
-    BasePort,
-    ControlClient,
-    ControlConnected,
-    Incoming,
-    Killed,
-    Monitor,
-    Network,
-    PacketReceived,
-    ParentGone,
-    PublishedHistory,
-    RateLimitedLog,
-    ReplyReceived,
-    Subscriber,
-    receive_frames,
-    send_frames,
-    send_packet,
-)
+from afspm.transport import Network, ParentGone, PublishedHistory, RateLimitedLog
+from afspm.transport.control_client import ControlClient
+from afspm.transport.frames import receive_frames, send_frames, send_packet
+from afspm.transport.network import ACCEPTED, DISCONNECTED, Monitor
+from afspm.transport.port import ControlConnected, Incoming, Killed, PacketReceived, ReplyReceived
+from afspm.transport.subscriber import Subscriber
+from afspm.transport.zmq_port import BasePort
 from afspm.wire.messages import CONTROL_STATE, SCOPE_STATE
 from afspm_published import version_1
 from afspm_published.version_1 import Pacing
 
 if TYPE_CHECKING:
     from afspm.basics import Clock
-    from afspm.processes import ProcessContext
+    from afspm.transport import ProcessContext
 
 SETTLED_S: Final = 0.05
 """Real time from a subscription to its replay. A peer subscribes several times in a row, and drops packets older than

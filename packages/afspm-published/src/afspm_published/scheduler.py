@@ -13,29 +13,17 @@ import zmq
 from afspm import wire
 from afspm.basics import ConfigError, ExitCode, WireError
 from afspm.model import ControlRequest, ControlResponse, Request, Response, ResponseDetail, Role, component_of
-from afspm.processes import (
-    CONNECTED,
-    DISCONNECTED,
-    MAX_PACKET_BYTES,
-    BasePort,
-    Incoming,
-    Monitor,
-    Network,
-    ParentGone,
-    PeerAsked,
-    PeerConnected,
-    PeerDisconnected,
-    RateLimitedLog,
-    Router,
-    RouterEvent,
-    receive_frames,
-    send_frames,
-)
+from afspm.transport import Network, ParentGone, PeerAsked, RateLimitedLog, Router
+from afspm.transport.frames import receive_frames, send_frames
+from afspm.transport.network import CONNECTED, DISCONNECTED, MAX_PACKET_BYTES, Monitor
+from afspm.transport.port import Incoming
+from afspm.transport.router import PeerConnected, PeerDisconnected, RouterEvent
+from afspm.transport.zmq_port import BasePort
 from afspm.wire.messages import CONTROL_STATE
 from afspm_published import version_1
 
 if TYPE_CHECKING:
-    from afspm.processes import ProcessContext
+    from afspm.transport import ProcessContext
 
 CACHE_WITHIN_S: Final = 2.0
 """Real time within which a scheduler of version 1 sends its cache; no message marks the end of the cache."""

@@ -30,30 +30,19 @@ from afspm.model import (
 )
 from afspm.model.fencing import Epoch, SchedulerFence
 from afspm.model.sessions import run_of
-from afspm.processes import (
-    CONNECTED,
-    DISCONNECTED,
-    MAX_PACKET_BYTES,
-    FreePorts,
-    Monitor,
-    Network,
-    ParentGone,
-    Poller,
-    RequestReceived,
-    Served,
-    SubscriberJoined,
-    WakeUp,
-    ZmqServerPort,
-    receive_frames,
-    send_frames,
-)
+from afspm.supervisor import FreePorts
 from afspm.supervisor.process import GUARD
 from afspm.translator.requests import RequestOutcomes
+from afspm.transport import Network, ParentGone, Poller, WakeUp
+from afspm.transport.frames import receive_frames, send_frames
+from afspm.transport.network import CONNECTED, DISCONNECTED, MAX_PACKET_BYTES, Monitor
+from afspm.transport.port import RequestReceived, Served, SubscriberJoined
+from afspm.transport.zmq_server import ZmqServerPort
 from afspm.wire.messages import SCOPE_STATE, SPECTRUM
 from afspm_published import version_1
 
 if TYPE_CHECKING:
-    from afspm.processes import ProcessContext
+    from afspm.transport import ProcessContext
 
 STOPPED_WITHIN_S: Final = 2.0
 """Real time that the published translator has to stop its measurement when the experiment ends."""

@@ -11,7 +11,7 @@ from typing import Final
 
 from afspm.basics import Launch
 from afspm.model import ControlRequest, ControlResponse, Packet, Request, Response, ScopeState
-from afspm.processes import Network
+from afspm.transport import Network
 from afspm.wire import KILL, encode_response, encode_subject
 from afspm.wire.messages import (
     CONTROL_STATE,

@@ -14,7 +14,7 @@ from afspm.experiment.toml_writer import dumps as toml_text
 from afspm.experiment.toml_writer import value as toml
 from afspm.experiment.wiring_classes import WIRE_KEYS, WiringClass, wire_of
 from afspm.model import Role
-from afspm.transport.network import is_local
+from afspm.transport import is_local
 
 if TYPE_CHECKING:
     from afspm.experiment.resolved_experiment import ResolvedExperiment

@@ -8,8 +8,9 @@ import logging
 from pathlib import Path
 from typing import ClassVar, Final
 
-from afspm import Component, OutageLog, PlannedWork, write_atomic
+from afspm import Component
 from afspm.basics import Angle, ConfigError, Length, MeasurementFailed, counted, quantity
+from afspm.components import OutageLog, PlannedWork, write_atomic
 from afspm.model import Region, names
 from afspm.plugins.adaptive.mapping import (
     MOST_SPECTRA,

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
-from afspm import Array
+from afspm.components import Array
 
 _MOST_FITTED: Final = 240  # measurements for the likelihood, whose time grows with the cube
 _LEAST_NOISE: Final = 1e-4  # variance relative to the squared amplitude; with less the matrix is not solved stably

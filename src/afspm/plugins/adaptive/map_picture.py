@@ -10,8 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 
-from afspm import Array
 from afspm.basics import counted, scale
+from afspm.components import Array
 from afspm.drawing import CATEGORICAL, PROBLEM, Contrast, draw_scale_bar, gold, value_range
 from afspm.model import Region
 from afspm.plugins.adaptive.mapping import MapProgress

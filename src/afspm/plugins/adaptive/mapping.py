@@ -22,7 +22,7 @@ from afspm.basics import (
 from afspm.model import Region, Spectrum
 from afspm.plugins.adaptive.quantities import Evaluation, evaluation
 from afspm.plugins.adaptive.refinement import ID, AdaptiveMap, LatticeMap, NestedGrid, Optimizer
-from afspm.processes import find_object
+from afspm.transport import find_object
 
 MOST_SPECTRA: Final = 1500
 """Largest number of spectra in a map. For this number the Gaussian process takes about a second; the time grows with

@@ -9,10 +9,10 @@ from typing import Final
 
 import numpy as np
 
-from afspm import Array
 from afspm.basics import ConfigError, InvalidValue
+from afspm.components import Array
 from afspm.model import Spectrum
-from afspm.processes import find_object
+from afspm.transport import find_object
 
 _EDGE: Final = (0.2, 0.65)
 """Limits of the fit to a band edge, as shares of the largest conductance on its side. Between them the conductance

@@ -24,8 +24,8 @@ from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 
-from afspm import Array
 from afspm.basics import InvalidValue
+from afspm.components import Array
 from afspm.model import Region
 from afspm.plugins.adaptive.gaussian_process import GaussianProcess, Parameters, distances, fitted
 

@@ -23,8 +23,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import Scope, Value, connect
+from afspm import Scope, connect
 from afspm.basics import NS_PER_S, imports_of_extra
+from afspm.client import Value
 from afspm.model import Region, names
 from afspm.record import field_names
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from afspm.processes import AFTERWARDS, DeclaredCommands, NoProgress
+from afspm.cli import AFTERWARDS, DeclaredCommands, NoProgress
 
 _FILES = "files"
 
@@ -73,8 +73,8 @@ def files(
     the current folder.
     """
     one_thread_a_process()
+    from afspm.experiment import importing_from
     from afspm.plugins.drift.report import file_commands as drift_files
-    from afspm.processes import importing_from
 
     # only for a class of one's own: the current folder may be a download, with a module named like a library's
     folders = [Path.cwd()] if "." in estimator + tracker else []

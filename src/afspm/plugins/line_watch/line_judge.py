@@ -31,8 +31,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import Array, from_plain, to_plain
 from afspm.basics import Plain
+from afspm.components import Array, from_plain, to_plain
 from afspm.model import Region
 from afspm.plugins.line_watch.registration import (
     CLIP_SIGMAS,

@@ -9,18 +9,9 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
-from afspm import (
-    Array,
-    ChannelPairing,
-    Component,
-    Events,
-    HeightPair,
-    MissingChannels,
-    Publication,
-    PublishedEvent,
-    tip_verdict,
-)
+from afspm import Component, Events, PublishedEvent
 from afspm.basics import NS_PER_S, UnitError, convert
+from afspm.components import Array, ChannelPairing, HeightPair, MissingChannels, Publication, tip_verdict
 from afspm.model import (
     HEIGHT,
     HEIGHT_RETRACE,

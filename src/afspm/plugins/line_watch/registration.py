@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from afspm import SD_PER_MAD, Array
+from afspm.components import SD_PER_MAD, Array
 
 Shift = tuple[float, float]
 """(rows, columns) from the running scan to the same feature in the template."""

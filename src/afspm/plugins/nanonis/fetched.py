@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from afspm import write_atomic
 from afspm.basics import ConfigError, FileError
+from afspm.components import write_atomic
 from afspm.driver import FileFacts, encode_scan, encode_spectrum
 from afspm.model import Region, Scan, ScanLines, Spectrum
 from afspm.plugins.nanonis.parameter_groups import Ask

@@ -17,8 +17,8 @@ from typing import Final
 
 import numpy as np
 
-from afspm import Array
 from afspm.basics import FileError
+from afspm.components import Array
 from afspm.driver import FileContent, local_ns, name_and_unit, text_of
 from afspm.model import XY, Region, Scan, Spectrum
 from afspm.plugins.nanonis.scan_files import CONTROLLER

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import Array
 from afspm.basics import FileError, PlainMapping
+from afspm.components import Array
 from afspm.driver import FileContent, hdf5_reading
 from afspm.model import Region, Scan, Spectrum
 

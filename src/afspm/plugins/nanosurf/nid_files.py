@@ -18,8 +18,8 @@ from typing import Final
 
 import numpy as np
 
-from afspm import Array
 from afspm.basics import FileError, si
+from afspm.components import Array
 from afspm.driver import FileContent, local_ns, text_of
 from afspm.model import Region, Scan, Spectrum
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from afspm.basics import counted
-from afspm.processes import AFTERWARDS, RUNS, RecordedRun, names_in, opt
+from afspm.cli import AFTERWARDS, RUNS, RecordedRun, names_in, opt
 
 app = typer.Typer(rich_markup_mode=None, rich_help_panel=AFTERWARDS)
 

@@ -10,14 +10,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from afspm import GUEST, Run, open_run, wire
+from afspm import Run, open_run, wire
 from afspm.basics import NS_PER_S, ConfigError, ExperimentClock, FileError, Launch, Sockets, is_address
+from afspm.client import GUEST
 from afspm.model import Frame
 from afspm.night import RecordPlayback
 from afspm.plugins.replay.replayer import Replayer
-from afspm.processes import FreePorts, RateLimitedLog, is_local, run_time
 from afspm.record import ENDED, EXPERIMENT_FILE, REPLAY_OF, STATE_DIR, lock_run
-from afspm.supervisor import run_folder
+from afspm.supervisor import FreePorts, run_folder, run_time
+from afspm.transport import RateLimitedLog, is_local
 from afspm.transport.process import signals
 
 BEFORE_S = 1.0

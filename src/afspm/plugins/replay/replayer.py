@@ -11,7 +11,7 @@ from afspm import wire
 from afspm.basics import NS_PER_S, ExperimentClock, TransportError, WireError
 from afspm.model import CLOCK_REQUEST, RELAY_REQUEST, ControlResponse, Packet, Response
 from afspm.night import RecordPlayback
-from afspm.processes import (
+from afspm.transport import (
     Network,
     PeerAsked,
     Poller,

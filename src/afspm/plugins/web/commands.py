@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from afspm.basics import Plain, PlainMapping, parse_toml
-from afspm.processes import MEANWHILE, RUNS, Where, opt
+from afspm.cli import MEANWHILE, RUNS, Where, opt
 
 if TYPE_CHECKING:
     from types import FrameType
 
+    from afspm.experiment import Experiment
     from afspm.plugins.web.dashboard import Dashboard
     from afspm.plugins.web.dashboard.recorded import RecordedSettings
-    from afspm.processes import Experiment, Port, ResumableRun
+    from afspm.supervisor import ResumableRun
+    from afspm.transport import Port
 
 NAME_OF_CLASS = "Dashboard"
 
@@ -96,7 +98,7 @@ def page_of(experiment: Experiment, started: Sequence[str]) -> tuple[str, PlainM
 
 def with_page(files: list[Path]) -> Experiment:
     """Return the experiment, with a dashboard added if its files define none."""
-    from afspm.processes import load_experiment
+    from afspm.experiment import load as load_experiment
 
     experiment = load_experiment(*files)
     return experiment if _has_dashboard(experiment) else load_experiment(*files, _overlay())
@@ -146,8 +148,8 @@ def _people_in(file: Path) -> dict[str, str]:
 
 def _run_here(where: Path) -> Path | None:
     # None: an experiment file without a run here; its run was started on another computer
-    from afspm import find_run
     from afspm.basics import FileError
+    from afspm.client import find_run
 
     try:
         return find_run(where)
@@ -162,8 +164,9 @@ def _join(folder: Path, settings: Plain) -> int:
     import sys
 
     from afspm.basics import ExitCode, require
+    from afspm.cli import looking
+    from afspm.experiment import DASHBOARD
     from afspm.plugins.web.dashboard import Dashboard
-    from afspm.processes import DASHBOARD, looking
     from afspm.record import read_run_json
 
     url = _url_in(read_run_json(folder).get("processes"), folder, DASHBOARD)
@@ -199,10 +202,11 @@ def _run_as_guest(folder: Path, dashboard: Dashboard, name: str) -> int:
     import dataclasses
     import logging
 
-    from afspm import guest_of
     from afspm.basics import ExperimentClock
-    from afspm.processes import ProcessActivity, ProcessContext, new_session, open_port, register_own_messages
+    from afspm.client import guest_of
     from afspm.record import STATE_DIR
+    from afspm.supervisor import register_own_messages
+    from afspm.transport import ProcessActivity, ProcessContext, new_session, open_port
 
     launch = guest_of(folder, name)
     register_own_messages(folder, launch.messages)
@@ -226,7 +230,7 @@ def _ended_by_ctrl_c(port: Port) -> Iterator[None]:
     # a dashboard that joins has no parent process: a signal stands for the parent's end
     import signal
 
-    from afspm.processes import ParentGone
+    from afspm.transport import ParentGone
 
     def end(_number: int, _frame: FrameType | None) -> None:
         port.wake_up(ParentGone())
@@ -241,9 +245,9 @@ def _ended_by_ctrl_c(port: Port) -> Iterator[None]:
 
 def _serve_recorded(folder: Path, settings: Plain) -> None:
     from afspm.basics import require
+    from afspm.experiment import DASHBOARD
     from afspm.plugins.web.dashboard import Dashboard
     from afspm.plugins.web.dashboard.recorded import serve
-    from afspm.processes import DASHBOARD
 
     require(Dashboard)
     serve(_recorded(folder, DASHBOARD, settings), typer.echo)
@@ -261,7 +265,7 @@ def _start_part(file: Path) -> int:
     import sys
 
     from afspm.basics import ConfigError
-    from afspm.processes import RunOptions, dry_run, run_experiment
+    from afspm.supervisor import RunOptions, dry_run, run_experiment
 
     experiment = with_page([file])
     names = [one.name for one in experiment.resolved.processes.values() if one.class_path.endswith(f".{NAME_OF_CLASS}")]

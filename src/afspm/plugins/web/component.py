@@ -11,14 +11,14 @@ from afspm.night import plans_of
 from afspm.plugins.web.archive import Archive
 from afspm.plugins.web.server import STALLED_S, WebServer, listening, url_of
 from afspm.plugins.web.watch import Watch
-from afspm.processes import step_back
 from afspm.record import bands_allowed, cut_off_message, run_json_or_empty
+from afspm.transport import step_back
 
 if TYPE_CHECKING:
     import socket
 
     from afspm.plugins.web.asgi import AsgiApp
-    from afspm.processes import ProcessContext
+    from afspm.transport import ProcessContext
 
 
 class WebComponent(Component):

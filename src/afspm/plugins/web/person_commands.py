@@ -6,7 +6,8 @@ import math
 from collections import deque
 from collections.abc import Callable
 
-from afspm import FITS, Value, is_set, to_parameter, wire
+from afspm import wire
+from afspm.client import FITS, ExperimentLink, Value, is_set, to_parameter
 from afspm.model import (
     LEASE_REQUEST,
     RELAY_REQUEST,
@@ -27,7 +28,6 @@ from afspm.model import (
 )
 from afspm.night import Overview
 from afspm.plugins.web.watch import Watch, is_free
-from afspm.processes import ExperimentLink
 
 ANSWER_S = 20.0  # real time for an answer
 FREE_S = 60.0  # real time for the microscope to reach a place

@@ -10,10 +10,11 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from afspm.basics import Clock, Launch
+from afspm.client import ExperimentLink
 from afspm.model import PERSON
 from afspm.plugins.web.person_commands import PersonCommands
 from afspm.plugins.web.watch import Watch
-from afspm.processes import ExperimentLink, Network, ParentGone, ZmqPort, new_session
+from afspm.transport import Network, ParentGone, ZmqPort, new_session
 
 MOST_PERSONS = 32  # each takes a thread and a connection
 T = TypeVar("T")

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from afspm import Array, tip_verdict
 from afspm.basics import Clock
+from afspm.components import Array, tip_verdict
 from afspm.model import ChannelRoles, ProblemNames, Scan, ScanLines, ScopeState, Spectrum
 from afspm.night import Overview, Plans
 from afspm.plugins.web.frames import FrameStore

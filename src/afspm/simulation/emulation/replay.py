@@ -20,7 +20,7 @@ from afspm.simulation.emulation.playback import Deviation, Playback
 from afspm.storage.atomic import write_atomic
 from afspm.translator.driver import Driver
 from afspm.translator.trace import ZEROMQ, TraceHeader, read_trace
-from afspm.transport.polling import milliseconds
+from afspm.transport import milliseconds
 
 RESULT = "replay.json"
 _AT_ONCE = 1 << 16

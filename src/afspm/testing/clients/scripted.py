@@ -11,11 +11,12 @@ import zmq
 
 from afspm.basics.clock import Clock
 from afspm.model import CLOCK_REQUEST, ControlResponse
+from afspm.transport import milliseconds
 from afspm.transport.frames import receive_frames
 from afspm.transport.keys import Keys
 from afspm.transport.late_joiners import BEACON, LONGEST, Marker
 from afspm.transport.network import ACCEPTED, Monitor, Network
-from afspm.transport.polling import Poller, WakeUp, milliseconds
+from afspm.transport.polling import Poller, WakeUp
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ from afspm.testing.components.memory_network import ControlLine, Weather
 from afspm.testing.components.scheduler_host import SchedulerHost
 from afspm.testing.components.simulated_process import Process
 from afspm.testing.components.simulated_time import SimulatedTime
-from afspm.transport.port import Port
+from afspm.transport import Port
 from afspm.transport.process.context import ProcessActivity, ProcessContext
 
 Time = str | float

@@ -12,9 +12,10 @@ from typing import Protocol
 
 from afspm import wire
 from afspm.basics.exit_codes import ExitCode
+from afspm.components import snapshot
 from afspm.model import LoggedPacket, Packet, Request, Response
 from afspm.model.events import component_of
-from afspm.model.snapshot import restored, snapshot
+from afspm.model.snapshot import restored
 from afspm.scheduler import Codec, Input, SavedState, SchedulerCore
 from afspm.scheduler.events import Effect
 from afspm.scheduler.saved_state import KIND, VERSION

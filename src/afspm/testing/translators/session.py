@@ -32,7 +32,8 @@ from afspm.testing.conformance import Lost
 from afspm.testing.processes import Processes
 from afspm.testing.translators.client import CheckClient
 from afspm.testing.translators.support import Support, find_out
-from afspm.transport.port import ParentGone, Port
+from afspm.transport import Port
+from afspm.transport.port import ParentGone
 from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import open_port
 

@@ -6,8 +6,8 @@ import json
 
 import numpy as np
 
-from afspm import Opinion, TipJudge
 from afspm.basics import PlainMapping
+from afspm.components import Opinion, TipJudge
 from afspm.model import Region
 from afspm_bench import analysis
 from afspm_bench.agents.script import XY, Script

@@ -11,8 +11,8 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from afspm import Opinion, TipJudge
 from afspm.basics import MeasurementFailed, PlainMapping, si
+from afspm.components import Opinion, TipJudge
 from afspm.model import Region, ScanSet, ScopeState, Spectrum, names
 from afspm_bench import analysis
 from afspm_bench.session import TrialSession

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from afspm import Array
+from afspm.components import Array
 from afspm.emulation import World
 from afspm.model import Region, names
 from afspm_bench import analysis

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from afspm.cli import NoProgress
 from afspm.plugins.drift.commands import Jobs, one_thread_a_process
-from afspm.processes import NoProgress
 
 
 def study(
@@ -30,7 +30,7 @@ def study(
 ) -> None:
     """Simulate many nights over a grid of settings, rank the settings, and check whether the defaults hold."""
     one_thread_a_process()
-    from afspm.processes import importing_from
+    from afspm.experiment import importing_from
     from afspm_lab.study import study_table
 
     with importing_from([Path.cwd()]):

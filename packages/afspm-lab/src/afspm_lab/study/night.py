@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from afspm import Array
+from afspm.components import Array
 from afspm.emulation import World
 from afspm.model import Frame, Region
 from afspm.plugins.drift.estimators import estimator

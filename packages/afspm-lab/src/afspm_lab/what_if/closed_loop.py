@@ -13,10 +13,11 @@ from typing import TextIO, TypeAlias
 
 from afspm import Run, open_run
 from afspm.basics import NS_PER_S, ConfigError, InvalidValue, Plain, PlainMapping, duration_text, from_json, utc_time
-from afspm.processes import RunOptions, run_experiment, toml_text
+from afspm.experiment import toml_text
 from afspm.record import ENDED, EXPERIMENT_FILE, run_json_or_empty
 from afspm.report.story import RunStory
 from afspm.report.story import read as read_story
+from afspm.supervisor import RunOptions, run_experiment
 from afspm.supervisor.own_runs import own_homes
 from afspm_lab.what_if.what_if import changed_experiment
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 import typer
 
 from afspm.basics import AfspmError, counted, day_and_time, iso_utc
-from afspm.processes import AFTERWARDS, NoProgress, names_in, opt
+from afspm.cli import AFTERWARDS, NoProgress, names_in, opt
 
 if TYPE_CHECKING:
     from afspm_lab.what_if.alignment import Difference, Output
@@ -160,7 +160,7 @@ def _replay(
 
 
 def _rerun(folder: Path, changes: GivenChanges, runs: Path) -> bool:
-    from afspm.processes import plain_console, plain_table
+    from afspm.cli import plain_console, plain_table
     from afspm_lab.what_if.closed_loop import rerun
 
     found = rerun(folder, changes or {}, runs=runs, terminal=sys.stderr)
@@ -171,7 +171,7 @@ def _rerun(folder: Path, changes: GivenChanges, runs: Path) -> bool:
 
 
 def _print(result: WhatIf) -> None:
-    from afspm.processes import plain_console, plain_table
+    from afspm.cli import plain_console, plain_table
     from afspm_lab.what_if.side_by_side import sides, where
 
     first = result.first

@@ -16,11 +16,11 @@ from tempfile import TemporaryDirectory
 
 from afspm.basics import NS_PER_S, AfspmError, ConfigError, ExperimentClock, Launch
 from afspm.model import ProblemNames
-from afspm.processes import ProcessActivity, ProcessContext
 from afspm.record import EXPERIMENT_FILE
 from afspm.record.run_json import RUN_FILE
 from afspm.storage.disk import SYNCER
 from afspm.storage.memory import SYNCED_WITHIN_S
+from afspm.transport import ProcessActivity, ProcessContext
 from afspm.transport.process.context import ExperimentProcess
 from afspm.transport.process.loading import load as load_class
 from afspm.wire.message_types import register_all as register_messages

@@ -7,8 +7,8 @@ from datetime import UTC
 from html import escape
 from pathlib import Path
 
-from afspm import replace_file
 from afspm.basics import FileError, counted, day_and_time
+from afspm.components import replace_file
 from afspm.report import document, section, table
 from afspm_lab.what_if.alignment import Difference
 from afspm_lab.what_if.side_by_side import changed_fields, message_name, sides, where

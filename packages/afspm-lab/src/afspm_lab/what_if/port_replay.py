@@ -13,9 +13,17 @@ from afspm import wire
 from afspm.basics import FileError, NeverLate, PlainList, WireError
 from afspm.client.port_log import LifeFacts
 from afspm.model import CLOCK_REQUEST, LEASE_REQUEST, RELAY_REQUEST, ControlRequest, ControlResponse, Packet, Response
-from afspm.processes import ControlConnected, Incoming, Killed, PacketReceived, ParentGone, ReplyReceived
 from afspm.storage.line_log import read_lines
-from afspm.transport.port import CaughtUp, ControlDisconnected
+from afspm.transport import ParentGone
+from afspm.transport.port import (
+    CaughtUp,
+    ControlConnected,
+    ControlDisconnected,
+    Incoming,
+    Killed,
+    PacketReceived,
+    ReplyReceived,
+)
 from afspm_lab.what_if.alignment import Output, PacketName
 from afspm_lab.what_if.outputs import OutputReader
 

@@ -11,14 +11,15 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import NoReturn
 
-from afspm import restored
 from afspm.basics import ConfigError, ExperimentClock, FileError, Launch, PlainList, WireError
-from afspm.processes import ProcessActivity, ProcessContext
-from afspm.scheduler import TIP_FRAME, CoordinateFrame, SavedState, Scheduler, SchedulerCore, WireCodec, events
+from afspm.components import restored
+from afspm.scheduler import SavedState, Scheduler, SchedulerCore, WireCodec, events
+from afspm.scheduler.coordinate_frame import TIP_FRAME, CoordinateFrame
 from afspm.scheduler.saved_state import KIND as STATE_KIND
 from afspm.scheduler.saved_state import VERSION as STATE_VERSION
 from afspm.scheduler.step_log import Restored, StateSums, Step, facts_of, read_cached, read_event
 from afspm.storage.line_log import read_lines
+from afspm.transport import ProcessActivity, ProcessContext
 from afspm.transport.process.loading import load as load_class
 from afspm_lab.what_if.alignment import Difference, Output, PacketName, aligned
 

@@ -12,23 +12,17 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from afspm import Component, Run, open_run
-from afspm.basics import (
-    NS_PER_S,
-    ConfigError,
-    FileError,
-    InvalidValue,
-    Launch,
-    day_and_time,
-    duration_text,
-    trusting_only,
-)
+from afspm.basics import NS_PER_S, ConfigError, FileError, InvalidValue, Launch, day_and_time, duration_text
+from afspm.basics.named_imports import trusting_only
 from afspm.client import port_log
+from afspm.experiment import Experiment, importing_from, toml_text
+from afspm.experiment.experiment import load_expanded
 from afspm.experiment.parts import ExperimentPart
 from afspm.model import Role
-from afspm.processes import Experiment, FreePorts, importing_from, load_expanded, toml_text
 from afspm.record import EXPERIMENT_FILE, run_json_or_empty
 from afspm.scheduler import step_log
 from afspm.storage.line_log import REQUESTS_FOLDER, read_lines
+from afspm.supervisor import FreePorts
 from afspm.supervisor.own_runs import own_homes
 from afspm.transport.process.loading import find_class
 from afspm.transport.process.loading import load as load_class

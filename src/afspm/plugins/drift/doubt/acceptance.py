@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import Array
+from afspm.components import Array
 from afspm.plugins.drift.doubt.coefficients import INTERCEPT, RIGHT, WEIGHTS
 
 Mask = NDArray[np.bool_]

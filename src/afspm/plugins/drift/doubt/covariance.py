@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from afspm import Array
+from afspm.components import Array
 from afspm.plugins.drift.doubt.coefficients import DOUBT, SPREAD
 from afspm.plugins.drift.pairs.images import Unusable
 from afspm.plugins.drift.registration.alignment import Believed, Fit

@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from afspm import Array
+from afspm.components import Array
 from afspm.plugins.drift.pairs.warp import CREEP, CREEP_PX, LINEAR
 
 SHEARS: Final = (0.003, 0.01)

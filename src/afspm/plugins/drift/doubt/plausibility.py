@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from afspm import Array
+from afspm.components import Array
 
 _STRETCHED = 2.0  # generous: thermal expansion, creep and shear by drift stay below a few per cent
 

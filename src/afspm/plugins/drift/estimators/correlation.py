@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from afspm import Array
 from afspm.basics import ConfigError
+from afspm.components import Array
 from afspm.plugins.drift.pairs.images import CommonGrid, Image, Unusable, onto_common_grid, prepare
 from afspm.plugins.drift.pairs.overlap import overlap_center_m
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration

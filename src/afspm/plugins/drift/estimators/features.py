@@ -14,8 +14,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import Array
 from afspm.basics import ConfigError
+from afspm.components import Array
 from afspm.plugins.drift.doubt.evidence import ConsensusEvidence, Standards, covariance_m2, weighed
 from afspm.plugins.drift.pairs.images import CommonGrid, Image, Unusable, onto_common_grid, prepare
 from afspm.plugins.drift.pairs.overlap import overlap_center_m

@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from afspm import Array
 from afspm.basics import ConfigError
+from afspm.components import Array
 from afspm.plugins.drift.doubt.acceptance import WRONG_AT_MOST, MatchEvidence, above_repeats, agreement
 from afspm.plugins.drift.doubt.covariance import Doubt, covariance, enlarged
 from afspm.plugins.drift.doubt.nuisances import CREEP_SD_PX, Shear, averaged

@@ -18,8 +18,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from afspm import Array, Run
+from afspm import Run
 from afspm.basics import FileError, InvalidValue
+from afspm.components import Array
 from afspm.drawing import reduced
 from afspm.model import XY, Frame, Region, Scan, ScanSet
 from afspm.night import ScanRow

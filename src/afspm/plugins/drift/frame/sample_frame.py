@@ -22,8 +22,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, get_args
 
-from afspm import from_plain
 from afspm.basics import AfspmError, replace
+from afspm.components import from_plain
 from afspm.model import (
     ControlRequest,
     LoggedPacket,

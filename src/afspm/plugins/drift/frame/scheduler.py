@@ -15,8 +15,8 @@ from afspm.plugins.drift.frame.scan_intake import MAPPING
 from afspm.plugins.drift.frame.settings import DriftCompensationSettings
 from afspm.plugins.drift.frame.worker import DriftWorkerInProcess
 from afspm.plugins.drift.frame.worker_process import DriftWorkerProcess
-from afspm.processes import ProcessContext
 from afspm.scheduler import Coordinates, Scheduler, WireCodec
+from afspm.transport import ProcessContext
 from afspm.wire import timestamp
 from afspm.wire.messages import DriftMapping, DriftRescan, ScanParameters2d
 

@@ -38,7 +38,7 @@ from afspm.plugins.drift.frame.settings import DriftCompensationSettings
 from afspm.plugins.drift.frame.worker_state import WorkerStateFile
 from afspm.plugins.drift.registration import DriftScan
 from afspm.plugins.drift.track import tracker
-from afspm.processes import leave_interrupts_to_parent
+from afspm.transport import leave_interrupts_to_parent
 
 
 @dataclass(frozen=True)

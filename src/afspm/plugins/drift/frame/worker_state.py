@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from afspm import write_atomic
 from afspm.basics import FileError, Plain
+from afspm.components import write_atomic
 
 _JSON = "json"
 _ARRAY = "array"

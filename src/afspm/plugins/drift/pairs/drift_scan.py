@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from afspm import Array
 from afspm.basics import InvalidValue
+from afspm.components import Array
 from afspm.model import Region
 
 

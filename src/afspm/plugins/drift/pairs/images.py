@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import SD_PER_MAD, Array, robust_spread
+from afspm.components import SD_PER_MAD, Array, robust_spread
 from afspm.plugins.drift.pairs.drift_scan import DriftScan
 
 Mask = NDArray[np.bool_]

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import Array
+from afspm.components import Array
 
 Real = TypeVar("Real", np.float32, np.float64)
 

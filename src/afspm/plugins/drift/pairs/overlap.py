@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from afspm import Array
 from afspm.basics import InvalidValue
+from afspm.components import Array
 from afspm.model import XY, Frame, Region
 
 

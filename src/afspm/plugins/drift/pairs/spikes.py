@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import Array
+from afspm.components import Array
 from afspm.plugins.drift.pairs.images import (
     SCAR_PX,
     Image,

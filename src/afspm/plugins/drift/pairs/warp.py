@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import Array
+from afspm.components import Array
 from afspm.plugins.drift.pairs.images import Image
 from afspm.plugins.drift.pairs.noise import CrossingLines
 

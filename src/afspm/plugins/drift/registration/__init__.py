@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import Array
+from afspm.components import Array
 from afspm.model import RegistrationOutcome
 from afspm.plugins.drift.pairs.drift_scan import DriftScan, Prior
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import Array
+from afspm.components import Array
 from afspm.plugins.drift.pairs.images import Unusable, flatten_rows
 from afspm.plugins.drift.pairs.noise import (
     LEAST_NOISE,

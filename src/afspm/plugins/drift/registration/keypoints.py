@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from afspm import Array
+from afspm.components import Array
 from afspm.plugins.drift.pairs.images import Image
 
 

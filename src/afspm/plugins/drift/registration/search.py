@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import Array
+from afspm.components import Array
 from afspm.plugins.drift.pairs.images import CommonGrid, Mask
 from afspm.plugins.drift.pairs.noise import independent_values, without_lines
 from afspm.plugins.drift.pairs.warp import COUNT, Scene, WarpedPair

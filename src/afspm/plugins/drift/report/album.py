@@ -8,7 +8,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from afspm import Array
+from afspm.components import Array
 from afspm.plugins.drift.registration import DriftScan, Registration
 from afspm.plugins.drift.report import style
 from afspm.plugins.drift.report.drawings import (

@@ -13,8 +13,8 @@ from matplotlib.patches import ConnectionPatch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from afspm import Array
 from afspm.basics import InvalidValue, typeset_length
+from afspm.components import Array
 from afspm.drawing import round_length_m
 from afspm.plugins.drift.registration import DriftScan, Matches
 from afspm.plugins.drift.report.style import (

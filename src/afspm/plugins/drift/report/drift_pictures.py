@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, ClassVar, Literal, overload
 
 import numpy as np
 
-from afspm import Component, LineFile, csv_line
+from afspm import Component
 from afspm.basics import NS_PER_S, AfspmError, FileError, counted, iso_utc
+from afspm.components import LineFile, csv_line
 from afspm.model import TOPOGRAPHY, ChannelName, RegistrationOutcome, of_role
 from afspm.plugins.drift.track.record import COLUMNS as RECORD
 from afspm.record import drift_at

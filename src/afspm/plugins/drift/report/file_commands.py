@@ -16,8 +16,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from afspm import Array, open_run, read, suffixes
+from afspm import open_run, read
 from afspm.basics import NS_PER_S, AfspmError, FileError, InvalidValue, ProgressLine, counted, day_and_time
+from afspm.components import Array, suffixes
 from afspm.driver import FileContent
 from afspm.model import RegistrationOutcome
 from afspm.plugins.drift.estimators import estimator

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from afspm.basics import area_text, position_text, quantity
-from afspm.processes import AFTERWARDS, opt
+from afspm.cli import AFTERWARDS, opt
 
 if TYPE_CHECKING:
     from afspm import Run
@@ -37,8 +37,8 @@ def compare(
     page with pictures, which alternate and subtract scans of equal size.
     """
     from afspm import open_run
+    from afspm.cli import plain_console, plain_table
     from afspm.plugins.drift.report.scan_pair import onto_first
-    from afspm.processes import plain_console, plain_table
     from afspm.report import compare as compared
     from afspm.report import rows_that_differ, write_comparison
 
@@ -102,7 +102,7 @@ def _percent(share: float) -> str:
 
 
 def _echo_regions(found: Remount, night: Run) -> None:
-    from afspm.processes import plain_console, plain_table
+    from afspm.cli import plain_console, plain_table
 
     keyed = {row.key: row.region for row in night.scans if row.key and row.region is not None}
     if not keyed:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from afspm import Array
 from afspm.basics import typeset_position
+from afspm.components import Array
 from afspm.model import Region
 from afspm.plugins.drift.estimators import estimator
 from afspm.plugins.drift.registration import DriftScan

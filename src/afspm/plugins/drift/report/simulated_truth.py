@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from afspm import Array
 from afspm.basics import AfspmError, FileError, Plain, from_json
+from afspm.components import Array
 from afspm.emulation import World
 from afspm.plugins.drift.registration import DriftScan
 

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.ticker import FuncFormatter
 
-from afspm import Array, flattened
 from afspm.basics import Plain, scale
+from afspm.components import Array, flattened
 from afspm.drawing import ValueRange, draw_scale_bar, save_figure, shared_range
 from afspm.plugins.drift.registration import DriftScan
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping as Table
 
-from afspm import restored
 from afspm.basics import ConfigError, InvalidValue, PlainMapping
+from afspm.components import restored
 from afspm.plugins.drift.estimators import estimator as default_estimator
 from afspm.plugins.drift.estimators.naming import named
 from afspm.plugins.drift.registration import Estimator

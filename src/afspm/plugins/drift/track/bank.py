@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from afspm import Array, restored, snapshot
 from afspm.basics import InvalidValue, Plain, PlainMapping
+from afspm.components import Array, restored, snapshot
 from afspm.plugins.drift.registration import DriftScan, Estimator, Registration
 from afspm.plugins.drift.track.filters import Filters
 from afspm.plugins.drift.track.forecast import BankForecast, Compensation

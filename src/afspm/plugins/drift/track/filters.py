@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from afspm import Array
+from afspm.components import Array
 
 _SHORT = 1e-2  # share of the fading time: below, differences of exponentials lose digits, and a series is exact enough
 

@@ -8,8 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from afspm import Array, snapshot
 from afspm.basics import Plain
+from afspm.components import Array, snapshot
 from afspm.plugins.drift.track.filters import Filters, Models, mixed
 from afspm.plugins.drift.track.mapping import Mapping
 from afspm.plugins.drift.track.tracking import FORECAST_VERSION, Prediction

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from afspm import Array
+from afspm.components import Array
 from afspm.plugins.drift.pairs.overlap import overlap_center_m
 from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 from afspm.plugins.drift.track.filters import Filters

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from afspm import Array
 from afspm.basics import FileError, InvalidValue
+from afspm.components import Array
 from afspm.model import Frame, Region, RegistrationOutcome
 from afspm.plugins.drift.registration import DriftScan, Registration
 from afspm.plugins.drift.track.record import DriftRecord

@@ -13,8 +13,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from afspm import Array, restored, snapshot
 from afspm.basics import ConfigError, Plain, PlainMapping
+from afspm.components import Array, restored, snapshot
 from afspm.plugins.drift.doubt.plausibility import unlike_drift
 from afspm.plugins.drift.pairs.overlap import intersection_ratio, sr_norm
 from afspm.plugins.drift.registration import DriftScan, Estimator, Registration

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import Array
 from afspm.basics import FileError
+from afspm.components import Array
 from afspm.model import RegistrationOutcome, registration_summary
 from afspm.plugins.drift.registration import DriftScan
 from afspm.plugins.drift.track.tracking import Update

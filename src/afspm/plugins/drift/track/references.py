@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from collections.abc import Mapping as Table
 from dataclasses import dataclass, replace
 
-from afspm import Array
+from afspm.components import Array
 from afspm.plugins.drift.pairs.overlap import overlap_ratio, sr_norm
 from afspm.plugins.drift.registration import DriftScan
 

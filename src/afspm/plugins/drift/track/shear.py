@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from afspm import Array
 from afspm.basics import InvalidValue
+from afspm.components import Array
 from afspm.plugins.drift.registration import DriftScan, Estimator, Prior, Registration
 from afspm.scheduler import undistorted
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import Array
+from afspm.components import Array
 from afspm.model import Frame
 from afspm.plugins.drift.registration import DriftScan, LinearSeen
 from afspm.plugins.drift.track.mapping import Mapping

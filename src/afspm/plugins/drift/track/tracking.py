@@ -8,8 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
-from afspm import Array
 from afspm.basics import InvalidValue, Plain, PlainMapping
+from afspm.components import Array
 from afspm.model import RegistrationOutcome
 from afspm.plugins.drift.registration import DriftScan, Registration
 from afspm.plugins.drift.track.mapping import Mapping

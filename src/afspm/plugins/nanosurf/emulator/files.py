@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from afspm import Array
 from afspm.basics import PlainMapping
+from afspm.components import Array
 from afspm.emulation import RETRACE, ScanActivity, SpectrumActivity
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import Array
+from afspm.components import Array
 from afspm.emulation import RETRACE, ScanActivity, SpectrumActivity
 from afspm.plugins.park.file_header import (
     CURVE_KINDS,

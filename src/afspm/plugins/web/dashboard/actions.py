@@ -9,8 +9,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 
-from afspm import from_parameter, value_in, wire
+from afspm import wire
 from afspm.basics import AfspmError, Plain, UnitError, counted, parse_quantity, quantity, typeset_position
+from afspm.client import from_parameter, value_in
 from afspm.model import (
     CLOCK_REQUEST,
     GRANT_REQUEST,

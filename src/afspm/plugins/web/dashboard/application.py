@@ -20,7 +20,7 @@ from afspm.plugins.web.dashboard.page import ASSETS, Page, Services
 from afspm.plugins.web.dashboard.sign_in import VISITOR, Guard, add_sign_in
 from afspm.plugins.web.passwords import is_loopback
 from afspm.plugins.web.watch import Bell
-from afspm.processes import RateLimitedLog
+from afspm.transport import RateLimitedLog
 
 
 def application(

@@ -9,8 +9,8 @@ from html import escape
 
 import numpy as np
 
-from afspm import Array
 from afspm.basics import Plain, quantity, time_of_day, typeset_position, zone_offset_s
+from afspm.components import Array
 from afspm.drawing import Axis, Curve, thinned
 from afspm.model import RegistrationOutcome, Spectrum, registration_summary
 from afspm.night import DriftPoint

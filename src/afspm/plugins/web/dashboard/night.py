@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from afspm import Array, Run, open_run
+from afspm import Run, open_run
 from afspm.basics import FileError, NeverLate
+from afspm.components import Array
 from afspm.model import XY, Note, Scan
 from afspm.night import Overview, RecordPlayback
 from afspm.plugins.web.frames import FrameStore

@@ -18,8 +18,8 @@ from fastapi import FastAPI, Response
 from fastapi.responses import FileResponse, PlainTextResponse
 from nicegui import events, ui
 
-from afspm import Levelling, append_note, levelled
 from afspm.basics import AfspmError, ExperimentClock, InvalidValue, Plain, time_of_day, typeset_area, zone_offsets_s
+from afspm.components import Levelling, append_note, levelled
 from afspm.drawing import DIVERGING, ValueRange, indices, png, value_range
 from afspm.model import PERSON
 from afspm.night import ScanRow

@@ -12,7 +12,7 @@ from typing import ClassVar
 
 from nicegui import ui
 
-from afspm import Levelling
+from afspm.components import Levelling
 from afspm.drawing import PALETTES, TIMELINE_CSS
 from afspm.plugins.web.dashboard.access import Access, Visitor
 from afspm.plugins.web.dashboard.actions import Steering

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
-from afspm import Array, Levelling, flattened, levelled
+from afspm.components import Array, Levelling, flattened, levelled
 from afspm.drawing import PALETTES, Contrast, ValueRange, indices, png, shared_range, shown_image
 from afspm.plugins.web.dashboard.scan_facts import Facts
 from afspm.plugins.web.frames import ChannelFrame

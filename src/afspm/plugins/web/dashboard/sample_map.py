@@ -10,8 +10,8 @@ from urllib.parse import quote
 
 import numpy as np
 
-from afspm import Array
 from afspm.basics import counted, quantity, scale, time_of_day, typeset_area, typeset_position
+from afspm.components import Array
 from afspm.drawing import Axis
 from afspm.model import XY, Region
 from afspm.night import FoundPlace, ScanSummary, SpectrumSummary

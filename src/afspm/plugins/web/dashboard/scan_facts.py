@@ -8,8 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import SD_PER_MAD
 from afspm.basics import NS_PER_S, duration_text, quantity, scale, time_of_day, typeset, typeset_area
+from afspm.components import SD_PER_MAD
 from afspm.model import RETRACE, XY, ActByHand, ChannelRoles, TipStatus
 from afspm.night import Overview, ScanSummary
 from afspm.plugins.web.frames import ChannelFrame

@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from afspm import replace_file
 from afspm.basics import from_json
+from afspm.components import replace_file
 
 if TYPE_CHECKING:
     from itsdangerous import URLSafeSerializer

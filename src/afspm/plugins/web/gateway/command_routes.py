@@ -11,8 +11,8 @@ from fastapi.security import HTTPBasic, HTTPBearer
 from starlette.requests import Request
 from starlette.responses import Response as HttpResponse
 
-from afspm import ScanTarget, SpectrumTarget, Target, xy_of
 from afspm.basics import AfspmError, Plain
+from afspm.client import ScanTarget, SpectrumTarget, Target, xy_of
 from afspm.model import WAIT_FOR_CONTROL, ControlMode, ControlState, Region, Response, names
 from afspm.plugins.web.gateway.measurements import Measurement
 from afspm.plugins.web.gateway.models import (

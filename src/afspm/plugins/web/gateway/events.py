@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 from google.protobuf.message import Message
 
-from afspm import open_run, to_plain, wire
+from afspm import open_run, wire
 from afspm.basics import AfspmError, WireError, iso_utc
+from afspm.components import to_plain
 from afspm.model import (
     ControlResponse,
     ControlState,
@@ -27,8 +28,8 @@ from afspm.model import (
     ScopeStatus,
     Spectrum,
 )
-from afspm.processes import log_folder, logged_packets
 from afspm.record import JOURNAL_FILE
+from afspm.storage import log_folder, logged_packets
 
 _log = logging.getLogger("afspm.plugins.web.gateway")
 

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from afspm import BEGUN_WITHIN_S, Cycle, CycleOutcome, Memory, ScanTarget, Target, target_from
+from afspm import Memory
 from afspm.basics import Plain
+from afspm.client import BEGUN_WITHIN_S, Cycle, CycleOutcome, ScanTarget, Target, target_from
 from afspm.model import ControlResponse, Response, Scan, ScopeStatus, Spectrum
 from afspm.model.sessions import KEYED
 from afspm.plugins.web.gateway.models import MeasurementModel, MeasurementState

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from afspm.basics import AfspmError, ExperimentEnded, NoResponse, iso_utc
 from afspm.model import HAS_ENDED, ControlResponse, Response, ResponseDetail
-from afspm.processes import StopRequested
+from afspm.transport import StopRequested
 
 
 class RefusalCode(Enum):

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 
-from afspm import Levelling
 from afspm.basics import iso_utc
+from afspm.components import Levelling
 from afspm.model import ControlMode, ControlResponse, ControlState, Spectrum, names
 from afspm.model import Response as ModelResponse
 from afspm.night import ScanSummary, SpectrumSummary

@@ -20,7 +20,7 @@ from afspm.plugins.web.gateway.stream import StreamCount
 from afspm.plugins.web.person_commands import PersonCommands
 from afspm.plugins.web.persons import Persons
 from afspm.plugins.web.watch import Bell, Watch
-from afspm.processes import StopRequested
+from afspm.transport import StopRequested
 
 T = TypeVar("T")
 MOST_WAITING = 16

@@ -10,8 +10,10 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from afspm import Levelling, from_parameter, levelled, wire
+from afspm import wire
 from afspm.basics import iso_utc
+from afspm.client import from_parameter
+from afspm.components import Levelling, levelled
 from afspm.drawing import indices, png, value_range
 from afspm.model import Region, Response, names
 from afspm.night import Overview, ScanSummary, SpectrumSummary
