@@ -331,14 +331,14 @@ def test_page_shows_the_end_of_each_component_and_of_the_experiment() -> None:
     watch = Watch(clock, plans=plans, began_ns=began_ns)
     watch.take("ControlState", ControlState(ControlMode.AUTOMATED, "series"), clock.now_ns())
     before = status_html(watch, watch.overview)
-    assert re.search(r'data-part="end">ends about \d\d:\d\d<small>15 min', before), before
+    assert re.search(r'data-part="end">ends about \d\d:\d\d <small>15 min', before), before
     watch.take("Progress", Progress(clock.now_ns(), "series", 1, 4, 2 * 86_400.0), clock.now_ns(), "Progress_series")
     html = status_html(watch, watch.overview)
     assert "<b>series</b> 1 of 4</span>" in html, "the end of the experiment stands beside it"
-    assert re.search(r'data-part="end">ends about \d{4}-\d\d-\d\d \d\d:\d\d<small>2 d', html), html
+    assert re.search(r'data-part="end">ends about \d{4}-\d\d-\d\d \d\d:\d\d <small>2 d', html), html
     alone = status_html(Watch(clock, past=watch.overview), watch.overview)
     assert 'data-part="end"' not in alone
-    assert re.search(r"<b>series</b> 1 of 4<small>ends \d{4}-\d\d-\d\d \d\d:\d\d</small>", alone), alone
+    assert re.search(r"<b>series</b> 1 of 4 <small>ends \d{4}-\d\d-\d\d \d\d:\d\d</small>", alone), alone
 
 
 # --- curves ---
