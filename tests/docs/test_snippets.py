@@ -35,7 +35,10 @@ from afspm_bench import sealing
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *sorted((ROOT / "experiments").rglob("*.md"))]
-OF_PACKAGES = sorted((ROOT / "packages").glob("*/README.md")) + sorted((ROOT / "packages").glob("*/docs/*.md"))
+PAGES += [page for name in ("agents", "lab") for page in (ROOT / "packages" / f"afspm-{name}" / "docs").glob("*.md")]
+OF_PACKAGES = sorted((ROOT / "packages").glob("*/README.md")) + sorted(
+    (ROOT / "packages").glob("afspm-published/docs/*.md")
+)
 """Pages whose snippets run in the tests of their package."""
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\((?!https?:|#|mailto:)([^)#]+)")
