@@ -24,7 +24,7 @@ def test_how_to_pages_stand_in_four_groups(builder: ModuleType) -> None:
     sections = tomllib.loads(f"nav = {builder._nav()}")["nav"][1:]
     groups = {title: pages for section in sections for title, pages in section.items()}
     assert list(groups) == ["Tutorials", *HOW_TO, "Reference", "Explanation"]
-    shown = [page for title in HOW_TO for page in groups[title]]
+    shown = [page for title in HOW_TO for page in groups[title] if not page.startswith("packages/")]
     pages = [f"docs/how-to/{page.name}" for page in (ROOT / "docs/how-to").glob("*.md")]
     assert sorted(shown) == sorted(["CONTRIBUTING.md", *pages])
 

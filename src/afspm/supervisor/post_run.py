@@ -155,9 +155,10 @@ def report(folder: Path, log: RunLog) -> None:
     again = f"`afspm report {quoted(folder)}` writes it"
     command = [*python_command("afspm.report"), str(folder)]
     environment = {**os.environ, **python_environment(), "MPLBACKEND": "agg"}
+    stop = _Stop()
     try:
-        with signals.caught(_stop, -1), ProgressLine("writing the report"):
-            exit_code, output = _until_done(command, environment)
+        with signals.caught(stop, -1), ProgressLine("writing the report"):
+            exit_code, output = _until_done(command, environment, stop)
     except _Stopped as stopped:
         log.write(LOGGED_AS, logging.WARNING, f"no report: {stopped} came while it was written; {again}")
         if stopped.number == signal.SIGINT:
@@ -188,17 +189,32 @@ class _Stopped(BaseException):
         self.number = number
 
 
-def _stop(number: int) -> None:
-    raise _Stopped(number)
+class _Stop:
+    """Raises `_Stopped` for a signal; for one that comes while the process is being started, once it can be killed."""
+
+    def __init__(self) -> None:
+        self._is_started = False
+        self._came: int | None = None
+
+    def __call__(self, number: int) -> None:
+        if self._is_started:
+            raise _Stopped(number)
+        self._came = number
+
+    def started(self) -> None:
+        self._is_started = True
+        if self._came is not None:
+            raise _Stopped(self._came)
 
 
-def _until_done(command: Sequence[str], environment: Mapping[str, str]) -> tuple[int, bytes]:
+def _until_done(command: Sequence[str], environment: Mapping[str, str], stop: _Stop) -> tuple[int, bytes]:
     # raises TimeoutExpired once the process has used no processor for REPORT_STALLED_S
     none, pipe = subprocess.DEVNULL, subprocess.PIPE
     with subprocess.Popen(command, stdin=none, stdout=none, stderr=pipe, env=environment) as process:
         used_s = -1.0
         while True:
             try:
+                stop.started()
                 _, errors = process.communicate(timeout=REPORT_STALLED_S)
                 return process.returncode, errors
             except subprocess.TimeoutExpired:
