@@ -103,7 +103,7 @@ class ChannelRoles:
 
     def shown_curve(self, spectrum: Spectrum) -> Spectrum:
         """Return a spectrum with the roles of its variables."""
-        return spectrum if self.variables is None else replace(spectrum, roles=self.variables)
+        return spectrum if self.variables is None else replace(spectrum, declared_roles=self.variables)
 
     def topography_first(self, channels: Iterable[str]) -> tuple[str, ...]:
         """Return channels as they are shown: the topography first, the others in their order."""

@@ -33,7 +33,7 @@ class Spectrum:
         time_ns: time of measurement, ns since the Unix epoch; None if unknown.
         filename: the controller's own file; empty without a file.
         frame: coordinate system of the position.
-        roles: what the variables measure; by default found by the names that makers are known to use.
+        declared_roles: what the variables measure, as the driver says; None if it does not.
 
     Raises:
         InvalidValue: names, units and values do not fit together.
@@ -47,7 +47,7 @@ class Spectrum:
     time_ns: int | None = None
     filename: str = ""
     frame: Frame = Frame.TIP
-    roles: VariableRoles = field(default=FOUND_BY_NAME, repr=False)
+    declared_roles: VariableRoles | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if self.values.ndim != 2 or self.values.shape[1] != len(self.names) or len(self.names) != len(self.units):
@@ -71,6 +71,11 @@ class Spectrum:
         if name not in self.names:
             raise NoSuchItem(f"no variable {name!r}; there are {', '.join(self.names)}")
         return self.values[:, self.names.index(name)]
+
+    @property
+    def roles(self) -> VariableRoles:
+        """Return what the variables measure: as declared, or else found by the names that makers are known to use."""
+        return self.declared_roles or FOUND_BY_NAME
 
     def of(self, role: str) -> NDArray[np.float64]:
         """Return the values of what a variable measures, in SI, shape (points of this way,).
@@ -101,6 +106,13 @@ class Spectrum:
         unit = self.units[self.names.index(name)]
         values = convert(values, unit, si_unit(unit))
         return -values if quantity == HEIGHT and name in self.roles.towards else values
+
+    def si_unit_of(self, role: str) -> str:
+        """Return the SI unit of a variable by its role, for the way there or back; empty if the curve has none."""
+        quantity = role.removesuffix(RETRACE)
+        found = (self.roles.column(one, self.names) for one in (role, quantity))
+        name = next((one for one in found if one is not None), None)
+        return "" if name is None else si_unit(self.units[self.names.index(name)])
 
     def has(self, role: str) -> bool:
         """Return whether the curve has a variable that measures this."""

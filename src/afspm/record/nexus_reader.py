@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from afspm.basics.errors import FileError
 from afspm.basics.plain_data import Plain, from_json
 from afspm.model import Frame, Region, Scan, Spectrum
-from afspm.model.variables import FOUND_BY_NAME, VariableRoles
+from afspm.model.variables import VariableRoles
 from afspm.record.spectrum_grid import PointGrid
 from afspm.storage.formats import hdf5_reading
 from afspm.storage.formats.content import FileContent, OtherFormat
@@ -117,9 +117,9 @@ def _spectrum(file: h5py.File, about: Plain) -> Spectrum:
     )
 
 
-def _roles(variables: Any) -> VariableRoles:
+def _roles(variables: Any) -> VariableRoles | None:
     if not all("role" in one for one in variables):  # of an earlier version
-        return FOUND_BY_NAME
+        return None
     names = {one["role"]: (one["name"],) for one in variables if one["role"]}
     return VariableRoles(names, tuple(one["name"] for one in variables if one["towards"]))
 
