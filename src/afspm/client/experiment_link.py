@@ -34,6 +34,7 @@ from afspm.model import (
     ScanParameters,
     ScopeState,
     ScopeStatus,
+    Spectrum,
     TipStatus,
     request_name,
 )
@@ -102,7 +103,9 @@ class PublishedState:
             self._manual_ns, self._manual_since_ns = self.manual_ns(at_ns), None
 
     def with_roles(self, thing: Any) -> Any:
-        """Return a scan, or lines of one, with the roles of its channel; any other thing unchanged."""
+        """Return a scan, lines of one, or a curve with the roles of what it measures; any other thing unchanged."""
+        if isinstance(thing, Spectrum):
+            return self.channels.shown_curve(thing)
         return self.channels.shown(thing) if isinstance(thing, Scan | ScanLines) else thing
 
     def take_time(self, time_ns: int | None) -> None:

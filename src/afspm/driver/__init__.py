@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from afspm.basics.lazy import lazily
 
 if TYPE_CHECKING:
+    from afspm.model.variables import VariableRoles
     from afspm.storage.formats import hdf5_reading
     from afspm.storage.formats.content import FileContent, OtherFormat, local_ns, name_and_unit, text_of
     from afspm.translator.activity import Activity, TipWay
@@ -93,6 +94,7 @@ __all__ = [
     "TcpConnection",
     "TipWay",
     "Value",
+    "VariableRoles",
     "ZmqConnection",
     "action",
     "as_list",
@@ -125,6 +127,7 @@ if not TYPE_CHECKING:
     __getattr__ = lazily(
         __name__,
         {
+            "afspm.model.variables": "VariableRoles",
             "afspm.storage.formats": "hdf5_reading igor netcdf",
             "afspm.storage.formats.content": "FileContent OtherFormat local_ns name_and_unit text_of clock_ns",
             "afspm.translator.activity": "Activity TipWay",

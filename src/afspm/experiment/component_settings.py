@@ -24,7 +24,8 @@ from afspm.experiment.document import Document
 from afspm.experiment.findings import closest, nearest
 from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.validation_messages import report
-from afspm.model.channels import HEIGHT, NamesChannel
+from afspm.model.channels import NamesChannel
+from afspm.model.variables import HEIGHT
 
 # units of the annotations in basics.units, tried in this order
 _ANNOTATED = ("m", "s", "rad", "V", "A", "m/s", "Hz")

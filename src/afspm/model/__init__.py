@@ -23,9 +23,7 @@ from afspm.basics.lazy import lazily
 if TYPE_CHECKING:
     from afspm.model import parameter_names as names
     from afspm.model.channels import (
-        HEIGHT,
         HEIGHT_RETRACE,
-        RETRACE,
         TOPOGRAPHY,
         ChannelName,
         ChannelRoles,
@@ -91,6 +89,7 @@ if TYPE_CHECKING:
         ScopeState,
         ScopeStatus,
     )
+    from afspm.model.variables import HEIGHT, RETRACE
 
 __all__ = [
     "CLOCK_REQUEST",
@@ -179,9 +178,7 @@ if not TYPE_CHECKING:
     __getattr__ = lazily(
         __name__,
         {
-            "afspm.model.channels": (
-                "HEIGHT HEIGHT_RETRACE RETRACE TOPOGRAPHY ChannelName ChannelRoles both_ways of_role"
-            ),
+            "afspm.model.channels": "HEIGHT_RETRACE TOPOGRAPHY ChannelName ChannelRoles both_ways of_role",
             "afspm.model.events": (
                 "LONGEST_NOTE PERSON ControlEvent JournalEntries JournalEntry LogLine Note "
                 "ProcessCondition ProcessState ProcessStates Progress RelayedMessage Role component_of"
@@ -206,6 +203,7 @@ if not TYPE_CHECKING:
             "afspm.model.state": (
                 "ControlMode ControlState Feedback PositionChange ProbePosition ScopeState ScopeStatus"
             ),
+            "afspm.model.variables": "HEIGHT RETRACE",
         },
         names="afspm.model.parameter_names",
     )

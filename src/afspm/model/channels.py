@@ -8,13 +8,10 @@ from typing import Annotated, Final, TypeVar
 
 from afspm.basics.errors import ConfigError
 from afspm.model.scan import Scan, ScanLines
+from afspm.model.spectrum import Spectrum
+from afspm.model.variables import CURRENT, FOUND_BY_NAME, FREQUENCY_SHIFT, HEIGHT, RETRACE, VARIABLES, VariableRoles
 
-RETRACE: Final = ", retrace"
-"""End of the role of a channel that was measured on the way back."""
-HEIGHT: Final = "height"
 HEIGHT_RETRACE: Final = HEIGHT + RETRACE
-CURRENT: Final = "current"
-FREQUENCY_SHIFT: Final = "frequency shift"
 INTENSITY: Final = "intensity"
 """Role of the signal of a detector, where a beam scans instead of a tip."""
 TOPOGRAPHY: Final = "topography"
@@ -57,16 +54,18 @@ class ChannelRoles:
     Attributes:
         names: the microscope's names of each role. A scan has only one of them.
         others: names of channels without a role.
+        variables: the variables of curves by their roles; None if the microscope does not say.
     """
 
     names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     others: tuple[str, ...] = ()
+    variables: VariableRoles | None = None
 
     @classmethod
-    def declared(cls, names: Mapping[str, Sequence[str]]) -> ChannelRoles:
+    def declared(cls, names: Mapping[str, Sequence[str]], variables: VariableRoles | None = None) -> ChannelRoles:
         """Return the roles that a driver declares; under the name `OTHER` its channels without a role."""
         of_roles = {role: tuple(those) for role, those in names.items() if role != OTHER}
-        return cls(of_roles, tuple(names.get(OTHER, ())))
+        return cls(of_roles, tuple(names.get(OTHER, ())), variables)
 
     def changed(self, given: Mapping[str, str | Sequence[str]]) -> ChannelRoles:
         """Return the roles, with the names of the experiment file in place of the driver's.
@@ -76,13 +75,16 @@ class ChannelRoles:
         """
         found = {role: (names,) if isinstance(names, str) else tuple(names) for role, names in given.items()}
         for role, names in found.items():
-            if role not in (*ROLES, OTHER) or role == TOPOGRAPHY:
-                hint = f"one of {', '.join((*QUANTITIES, OTHER))}, or one of them with {RETRACE!r}"
+            if role == TOPOGRAPHY or role not in (*ROLES, OTHER, *VARIABLES, *(one + RETRACE for one in VARIABLES)):
+                known = dict.fromkeys((*QUANTITIES, *VARIABLES, OTHER))
+                hint = f"one of {', '.join(known)}, or one of them with {RETRACE!r}"
                 raise ConfigError(f"there is no role {role!r} of a channel", where="channels", hint=hint)
             if not all(isinstance(name, str) and name for name in names):
                 raise ConfigError(f"the name of the channel for {role!r} is {given[role]!r}", where="channels")
-        of_roles = {**self.names, **{role: names for role, names in found.items() if role != OTHER}}
-        return ChannelRoles(of_roles, (*self.others, *found.get(OTHER, ())))
+        of_roles = {**self.names, **{role: names for role, names in found.items() if role in ROLES}}
+        of_curves = {role: names for role, names in found.items() if role.removesuffix(RETRACE) in VARIABLES}
+        variables = (self.variables or FOUND_BY_NAME).changed(of_curves) if of_curves else self.variables
+        return ChannelRoles(of_roles, (*self.others, *found.get(OTHER, ())), variables)
 
     def with_topography(self, *, feedback_on: bool | None) -> ChannelRoles:
         """Return the roles with the topography: at constant height, the height shows nothing."""
@@ -98,6 +100,10 @@ class ChannelRoles:
         """Return a scan, or lines of one, with the roles of its channel."""
         roles = self.of(measured.channel)
         return replace(measured, roles=roles) if roles else measured
+
+    def shown_curve(self, spectrum: Spectrum) -> Spectrum:
+        """Return a spectrum with the roles of its variables."""
+        return spectrum if self.variables is None else replace(spectrum, declared_roles=self.variables)
 
     def topography_first(self, channels: Iterable[str]) -> tuple[str, ...]:
         """Return channels as they are shown: the topography first, the others in their order."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import TYPE_CHECKING
 
@@ -10,7 +10,9 @@ from afspm.basics import NoSuchItem, imports_of_extra, utc_time
 from afspm.basics.entry_points import DISPLAYS, required
 from afspm.basics.errors import InvalidValue
 from afspm.basics.plain_data import Plain
+from afspm.basics.units import convert, si_unit
 from afspm.model.geometry import XY, Frame
+from afspm.model.variables import FOUND_BY_NAME, HEIGHT, RETRACE, VariableRoles, turning_point
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,6 +33,7 @@ class Spectrum:
         time_ns: time of measurement, ns since the Unix epoch; None if unknown.
         filename: the controller's own file; empty without a file.
         frame: coordinate system of the position.
+        declared_roles: what the variables measure, as the driver says; None if it does not.
 
     Raises:
         InvalidValue: names, units and values do not fit together.
@@ -44,6 +47,7 @@ class Spectrum:
     time_ns: int | None = None
     filename: str = ""
     frame: Frame = Frame.TIP
+    declared_roles: VariableRoles | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if self.values.ndim != 2 or self.values.shape[1] != len(self.names) or len(self.names) != len(self.units):
@@ -67,6 +71,60 @@ class Spectrum:
         if name not in self.names:
             raise NoSuchItem(f"no variable {name!r}; there are {', '.join(self.names)}")
         return self.values[:, self.names.index(name)]
+
+    @property
+    def roles(self) -> VariableRoles:
+        """Return what the variables measure: as declared, or else found by the names that makers are known to use."""
+        return self.declared_roles or FOUND_BY_NAME
+
+    def of(self, role: str) -> NDArray[np.float64]:
+        """Return the values of what a variable measures, in SI, shape (points of this way,).
+
+        Args:
+            role: one of `VARIABLES`, for the way there; with ", retrace" for the way back. A height is positive away
+                from the sample; the swept variable of the way back has the order of the way back's points.
+
+        Raises:
+            NoSuchItem: the curve has no such variable, or no way back.
+        """
+        quantity = role.removesuffix(RETRACE)
+        is_back = role != quantity
+        there, back = (self.roles.column(one, self.names) for one in (quantity, quantity + RETRACE))
+        turn = turning_point(self.values[:, 0]) if back is None else None
+        # the swept variable has one column: the points of the way back, measured at the same time, have its values
+        is_swept = there is not None and there == self.names[0]
+        name = (back or (there if is_swept or turn is not None else None)) if is_back else there
+        if name is None or (is_back and is_swept and turn is None and not self._has_way_back):
+            known = [one for one in self.roles.roles_of(self.names) if one]
+            ways = [one + RETRACE for one in known if turn is not None]
+            raise NoSuchItem(
+                f"the curve has no {role!r}", hint=f"it has {', '.join([*known, *ways])} ({', '.join(self.names)})"
+            )
+        values = self[name]
+        if turn is not None:
+            values = values[turn:] if is_back else values[:turn]
+        unit = self.units[self.names.index(name)]
+        values = convert(values, unit, si_unit(unit))
+        return -values if quantity == HEIGHT and name in self.roles.towards else values
+
+    def si_unit_of(self, role: str) -> str:
+        """Return the SI unit of a variable by its role, for the way there or back; empty if the curve has none."""
+        quantity = role.removesuffix(RETRACE)
+        found = (self.roles.column(one, self.names) for one in (role, quantity))
+        name = next((one for one in found if one is not None), None)
+        return "" if name is None else si_unit(self.units[self.names.index(name)])
+
+    def has(self, role: str) -> bool:
+        """Return whether the curve has a variable that measures this."""
+        try:
+            self.of(role)
+        except NoSuchItem:
+            return False
+        return True
+
+    @property
+    def _has_way_back(self) -> bool:
+        return any(one.endswith(RETRACE) for one in self.roles.roles_of(self.names))
 
     def to_xarray(self) -> xarray.Dataset:
         """Return an xarray Dataset over the first variable (needs the extra `xarray`)."""

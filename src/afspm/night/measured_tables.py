@@ -105,13 +105,13 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
     ) -> Scan:
         """Return a map of a quantity over the grid, as a scan with one channel: the mean over repeats.
 
-            run.spectra.map("Current", at=0.5).plot()
+            run.spectra.map("current", at=0.5).plot()
             run.spectra.map(lambda spectrum: spectrum["Current"].max(), unit="A", name="largest current")
 
         Args:
-            quantity: the name of a variable, read at one value of the sweep; or a function of one spectrum that
-                returns a number.
-            at: the value of the sweep, in its unit.
+            quantity: what a variable measures, such as "current" or "current, retrace", or its name, read at one value
+                of the sweep; or a function of one spectrum that returns a number.
+            at: the value of the sweep: in SI for a measured quantity, in the unit of the sweep for a name.
             unit: the unit of the function's result.
             direction: "forward" or "backward" along the sweep.
             name: the channel of the map; by default derived from the variable or the function.

@@ -17,6 +17,7 @@ from afspm.model.arrays import Array
 from afspm.model.geometry import Frame, Region
 from afspm.model.scan import Scan
 from afspm.model.spectrum import Spectrum
+from afspm.model.variables import RETRACE, VARIABLES
 from afspm.night.netcdf_encoding import fit_classic_netcdf
 from afspm.record.spectrum_grid import DIRECTIONS, PointGrid, alike, at, columns_of, common_sweep, grid, repeats, ways
 
@@ -135,8 +136,15 @@ def map_of(
     if isinstance(quantity, str):
         if swept is None:
             raise InvalidValue(f"a map of {quantity} is one at a value of {first.names[0]}", hint="give at=…")
-        own_name, unit = f"{quantity} at {swept:g} {first.units[0]}", unit or _unit(first, quantity)
+        own_name = f"{quantity} at {swept:g} {first.units[0]}"
         number_of: Callable[[Spectrum], float] = partial(_value_at, quantity, swept, direction)
+        if quantity.removesuffix(RETRACE) in VARIABLES:
+            role = quantity if direction == DIRECTIONS[0] or quantity.endswith(RETRACE) else quantity + RETRACE
+            if not first.has(role):
+                known = ", ".join(filter(None, first.roles.roles_of(first.names)))
+                raise InvalidValue(f"no {role!r} was measured", hint=f"there are {known} ({', '.join(first.names)})")
+            number_of, unit = partial(_value_of_role, role, swept), unit or first.si_unit_of(role)
+        unit = unit or _unit(first, quantity)
     else:
         own_name, number_of = getattr(quantity, "__name__", "map").replace("<lambda>", "map"), quantity
     values = np.full((len(points.y_m), len(points.x_m), max(repeat_of) + 1), np.nan)
@@ -164,10 +172,25 @@ def _value_at(variable: str, value: float, direction: str, spectrum: Spectrum) -
     if variable not in by_direction[direction]:
         hint = f"there are {', '.join(by_direction[direction])}"
         raise InvalidValue(f"no variable {variable!r} was measured {direction}", hint=hint)
+    return _interpolated(value, swept, by_direction[direction][variable], f"{name} was swept", unit)
+
+
+def _value_of_role(role: str, value: float, spectrum: Spectrum) -> float:
+    swept_role = spectrum.roles.roles_of(spectrum.names)[0]
+    if not swept_role:
+        raise InvalidValue(f"{spectrum.names[0]!r} has no known role", hint="give a function of the spectrum")
+    back = RETRACE if role.endswith(RETRACE) else ""
+    swept = spectrum.of(swept_role + back)
+    return _interpolated(
+        value, swept, spectrum.of(role), f"the {swept_role} was swept", spectrum.si_unit_of(swept_role)
+    )
+
+
+def _interpolated(value: float, swept: Array, values: Array, what: str, unit: str) -> float:
     low, high = float(swept.min()), float(swept.max())
     if not low <= value <= high:
-        raise InvalidValue(f"{name} was swept from {low:g} to {high:g} {unit}, not to {value:g} {unit}")
-    return float(at(np.array([value]), swept, by_direction[direction][variable])[0])
+        raise InvalidValue(f"{what} from {low:g} to {high:g} {unit}, not to {value:g} {unit}")
+    return float(at(np.array([value]), swept, values)[0])
 
 
 def _grid_of(spectra: Sequence[Spectrum]) -> tuple[PointGrid, list[int]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from datetime import tzinfo
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from afspm.basics.errors import FileError
 from afspm.basics.plain_data import Plain, from_json
 from afspm.model import Frame, Region, Scan, Spectrum
+from afspm.model.variables import VariableRoles
 from afspm.record.spectrum_grid import PointGrid
 from afspm.storage.formats import hdf5_reading
 from afspm.storage.formats.content import FileContent, OtherFormat
@@ -112,7 +113,15 @@ def _spectrum(file: h5py.File, about: Plain) -> Spectrum:
         about["measured_ns"],
         about["filename"],
         Frame(about["frame"]),
+        _roles(variables),
     )
+
+
+def _roles(variables: Any) -> VariableRoles | None:
+    if not all("role" in one for one in variables):  # of an earlier version
+        return None
+    names = {one["role"]: (one["name"],) for one in variables if one["role"]}
+    return VariableRoles(names, tuple(one["name"] for one in variables if one["towards"]))
 
 
 def _grid(file: h5py.File, about: Plain) -> Iterator[Spectrum]:

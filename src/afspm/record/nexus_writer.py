@@ -102,8 +102,10 @@ def encode_spectrum(spectrum: Spectrum, circumstances: FileProvenance) -> bytes:
         "kind": spectrum.kind,
         "measured_ns": spectrum.time_ns,
         "variables": [
-            {"name": name, "unit": unit, "field": one}
-            for name, unit, one in zip(spectrum.names, spectrum.units, fields, strict=True)
+            {"name": name, "unit": unit, "field": one, "role": role, "towards": name in spectrum.roles.towards}
+            for name, unit, one, role in zip(
+                spectrum.names, spectrum.units, fields, spectrum.roles.roles_of(spectrum.names), strict=True
+            )
         ],
     }
 

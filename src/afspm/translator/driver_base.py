@@ -18,6 +18,7 @@ from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.basics.units import Duration, PollPeriod
 from afspm.model import ChannelRoles, ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.model.state import MEASURING
+from afspm.model.variables import VariableRoles
 from afspm.translator.judge import WITNESSES, Stated
 from afspm.translator.parameters import ParameterSpec, ParameterTable, Value
 from afspm.translator.polling import EAGER_S
@@ -178,7 +179,8 @@ class DriverBase(ABC):
 
     Args:
         parameters: rows added to the table or changed in it by the experiment file.
-        channels: names of channels by role, in place of those in `channel_roles`, and under "other" those without one.
+        channels: names of channels by role, in place of those in `channel_roles`, and under "other" those without one;
+            a role of curves, such as force, comes before those in `variable_roles`.
         actions: generic actions added by the experiment file: `{name = {set = {<parameter> = <value>}}}` sets
             parameters, `{name = {command = "<text>"}}` sends a text to the controller (`command`); an action may have
             both keys. With `for = "50 ms"` the microscope is busy for this time, and then the former values are
@@ -218,6 +220,8 @@ class DriverBase(ABC):
     """A file with default limits for this model of microscope, in the form of [limits]; None: there are none."""
     channel_roles: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({})
     """The maker's names of channels by role, as in `Scan.channel`; under "other" those without a role."""
+    variable_roles: ClassVar[VariableRoles | None] = None
+    """The maker's names of the variables of curves by role; None: found by names that makers are known to use."""
     translated: ClassVar[Collection[str]] = ()
     """The parameters that `read` and `write` of the class translate, rather than `get` and `set` by a row."""
     eager_poll_s: ClassVar[float] = EAGER_S
@@ -352,7 +356,7 @@ class DriverBase(ABC):
     @classmethod
     def declared_channels(cls, settings: PlainMapping) -> ChannelRoles:
         """Return the channels that a microscope of this kind may have with these settings."""
-        return ChannelRoles.declared(cls.channel_roles)
+        return ChannelRoles.declared(cls.channel_roles, cls.variable_roles)
 
     @classmethod
     def channels_of(cls, settings: PlainMapping) -> ChannelRoles:

@@ -20,6 +20,7 @@ from afspm.model.events import LogLines, MeasurementSettings
 from afspm.model.instruments import InstrumentOrders
 from afspm.model.panel import ChangedValue
 from afspm.model.state import FeedbackUnits
+from afspm.model.variables import VariableRoles
 from afspm.wire.generated import (
     channels_pb2,
     control_pb2,
@@ -315,15 +316,23 @@ ACT_BY_HAND = MessageMapping(
     changes=_each("changes", _CHANGED_VALUE),
 )
 _TIP = FieldMapping("", TIP_STATUS.to_wire, TIP_STATUS.from_wire)
+_ROLES = FieldMapping(
+    "roles",
+    lambda of_roles: [channels_pb2.ChannelRole(role=role, names=names) for role, names in of_roles.items()],
+    lambda roles: {_needed("a channel's role")(one.role): tuple(one.names) for one in roles},
+)
+VARIABLE_ROLES = MessageMapping(
+    VariableRoles,
+    channels_pb2.VariableRoles,
+    names=_ROLES,
+    towards=FieldMapping("towards", from_wire=tuple),
+)
 CHANNEL_ROLES = MessageMapping(
     model.ChannelRoles,
     channels_pb2.ChannelRoles,
-    names=FieldMapping(
-        "roles",
-        lambda of_roles: [channels_pb2.ChannelRole(role=role, names=names) for role, names in of_roles.items()],
-        lambda roles: {_needed("a channel's role")(one.role): tuple(one.names) for one in roles},
-    ),
+    names=_ROLES,
     others=FieldMapping("others", from_wire=tuple),
+    variables=FieldMapping("variables", VARIABLE_ROLES.to_wire, VARIABLE_ROLES.from_wire),
 )
 FEEDBACK_UNITS = MessageMapping(
     FeedbackUnits,

@@ -209,5 +209,5 @@ def test_a_curve_without_a_gap_is_refused() -> None:
     with pytest.raises(InvalidValue, match="no band edge"):
         evaluation("gap").of(metal)
     other = Spectrum((0.0, 0.0), "force", ("Z", "Force"), ("m", "N"), np.zeros((9, 2)))
-    with pytest.raises(InvalidValue, match="needs dI/dV or Current"):
+    with pytest.raises(InvalidValue, match="no 'bias'"):
         evaluation("gap").of(other)

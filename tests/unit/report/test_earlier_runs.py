@@ -38,7 +38,7 @@ def test_scans_and_curves_of_an_earlier_run_open(folder: Path) -> None:
             assert values.shape == (12, 16)
             assert np.isfinite(values).all()
         (curve,) = run.spectra
-        assert len(run.spectrum(curve).values) > 2
+        assert run.spectrum(curve).of("current").std() > 0.0
         assert any("the last scan is done" in line.text for line in run.log)
 
 

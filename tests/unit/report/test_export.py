@@ -226,6 +226,9 @@ def test_map_of_a_grid_is_a_scan(night: Night, store: RecordStore, tmp_path: Pat
     assert current.values == pytest.approx(np.array([[1, 2, 3], [4, 5, 6]]))
     assert (current.unit, current.channel) == ("A", "Current at 1 V")
     assert current.region.size_m == pytest.approx((4e-9, 3e-9))
+    by_role = spectra.map("current", at=1.0)
+    assert by_role.values == pytest.approx(current.values)
+    assert (by_role.unit, by_role.channel) == ("A", "current at 1 V")
     slope = spectra.map(lambda one: float(np.polyfit(one["Bias"], one["Current"], 1)[0]), unit="S")
     assert slope.values == pytest.approx(current.values)
     assert slope.channel == "map"
@@ -241,6 +244,8 @@ def test_map_of_a_grid_is_a_scan(night: Night, store: RecordStore, tmp_path: Pat
         ({"quantity": "Current", "at": 3.0}, "swept from -1 to 2 V, not to 3 V"),
         ({"quantity": "Current"}, "give at="),
         ({"quantity": "Force", "at": 1.0}, "no variable 'Force'"),
+        ({"quantity": "current", "at": 3.0}, "the bias was swept from -1 to 2 V, not to 3 V"),
+        ({"quantity": "force", "at": 1.0}, "no 'force' was measured"),
         ({"quantity": "Current", "at": 1.0, "direction": "up"}, "there is forward, backward"),
     ],
 )

@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import logging
+from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 from afspm import Component
 from afspm.basics import Angle, ConfigError, Length, MeasurementFailed, counted, quantity
@@ -20,7 +21,7 @@ from afspm.plugins.adaptive.mapping import (
     optimizer_of,
     rows,
 )
-from afspm.plugins.adaptive.quantities import evaluation
+from afspm.plugins.adaptive.quantities import QUANTITIES, evaluation
 
 MOST_LINES: Final = 20
 """Approximate largest number of log lines about the progress of a map."""
@@ -132,6 +133,12 @@ class Adaptive(Component):
             raise MeasurementFailed(f"none of the {len(failed)} positions of the map gave a value")
         if self.end_when_done:
             self.scope.end_experiment()
+
+    @classmethod
+    def needed_variables(cls, settings: Mapping[str, Any]) -> tuple[str, ...]:
+        """Return the roles of variables that the quantity of these settings reads, for `afspm check`."""
+        known = QUANTITIES.get(str(settings.get("quantity", "")))
+        return () if known is None else known.needs
 
     def on_end(self) -> None:
         found = self._progress

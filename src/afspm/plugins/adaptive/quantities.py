@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from afspm.basics import ConfigError, InvalidValue
+from afspm.basics import ConfigError, InvalidValue, NoSuchItem
 from afspm.components import Array
 from afspm.model import Spectrum
 from afspm.transport import find_object
@@ -22,12 +22,17 @@ _LEAST_POINTS: Final = 4
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A quantity: its name and unit, the kind of spectrum that shows it (None: any), and the function of a spectrum."""
+    """A quantity: its name and unit, the kind of spectrum that shows it (None: any), and the function of a spectrum.
+
+    Attributes:
+        needs: the roles of the variables that the function reads; "conductance or current": one of them.
+    """
 
     name: str
     unit: str
     kind: str | None
     function: Callable[[Spectrum], float]
+    needs: tuple[str, ...] = ()
 
     def of(self, spectrum: Spectrum) -> float:
         """Return the value of the quantity in a spectrum.
@@ -39,6 +44,8 @@ class Evaluation:
             value = float(self.function(spectrum))
         except InvalidValue:
             raise
+        except NoSuchItem as error:
+            raise InvalidValue(f"{self.name}: {error.what}", hint=error.hint) from error
         except Exception as error:  # a user's function may raise anything for an odd curve, and the map goes on
             raise InvalidValue(f"{self.name} of the curve: {type(error).__name__}: {error}") from error
         if not math.isfinite(value):
@@ -53,17 +60,16 @@ def gap_ev(spectrum: Spectrum) -> float:
     temperature rounds the edge itself.
 
     Raises:
-        InvalidValue: the spectrum has neither dI/dV nor Current, or shows no band edges.
+        NoSuchItem: the spectrum has no bias, or neither conductance nor current. InvalidValue: it shows no band edges.
     """
-    bias = spectrum.values[:, 0]
+    bias = spectrum.of("bias")
     order = np.argsort(bias)
-    bias = bias[order]
-    if "dI/dV" in spectrum.names:
-        conductance = spectrum["dI/dV"][order]
-    elif "Current" in spectrum.names:
-        conductance = np.gradient(spectrum["Current"][order], bias)
+    if spectrum.has("conductance"):
+        bias, conductance = bias[order], spectrum.of("conductance")[order]
     else:
-        raise InvalidValue(f"a gap needs dI/dV or Current; the curve has {', '.join(spectrum.names)}")
+        current = spectrum.of("current")[order]
+        bias = bias[order]
+        conductance = np.gradient(current, bias)
     width = max(1, len(bias) // 50)
     smoothed = np.convolve(conductance, np.full(width, 1.0 / width), mode="same")
     lowest = width + int(np.argmin(smoothed[width : len(bias) - width]))
@@ -75,15 +81,15 @@ def gap_ev(spectrum: Spectrum) -> float:
 def adhesion_n(spectrum: Spectrum) -> float:
     """Return the pull-off force in N: the negative of the lowest force while the tip withdraws.
 
-    Without the channel "Force Retrace", the channel "Force" is used.
+    Raises:
+        NoSuchItem: the spectrum has no force, or no way back: the approach has its lowest force at the snap-in.
     """
-    name = "Force Retrace" if "Force Retrace" in spectrum.names else "Force"
-    return -float(spectrum[name].min())
+    return -float(spectrum.of("force, retrace").min())
 
 
 QUANTITIES: Final = {
-    "gap": Evaluation("gap", "eV", "IV", gap_ev),
-    "adhesion": Evaluation("adhesion", "N", "force", adhesion_n),
+    "gap": Evaluation("gap", "eV", "IV", gap_ev, ("bias", "conductance or current")),
+    "adhesion": Evaluation("adhesion", "N", "force", adhesion_n, ("force, retrace",)),
 }
 
 
@@ -101,7 +107,7 @@ def evaluation(quantity: str, unit: str = "", kind: str | None = None) -> Evalua
         known = QUANTITIES[quantity]
         if unit:
             raise ConfigError(f"{quantity} is in {known.unit}", where="unit", hint="leave `unit` out")
-        return Evaluation(known.name, known.unit, kind or known.kind, known.function)
+        return replace(known, kind=kind or known.kind)
     if "." not in quantity:
         hint = f"one of {', '.join(QUANTITIES)}, or a function of a spectrum as module.name"
         raise ConfigError(f"no quantity is named {quantity!r}", where="quantity", hint=hint)

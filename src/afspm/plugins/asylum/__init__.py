@@ -29,6 +29,7 @@ from afspm.driver import (
     KeptSettings,
     ScriptedDriver,
     Value,
+    VariableRoles,
     action,
     frame,
     refuse_value,
@@ -69,6 +70,21 @@ _CHANNELS: Final = both_ways(
 )
 
 
+_VARIABLES: Final = VariableRoles.declared(
+    {
+        "height": ["ZSnsr", "Raw"],
+        "current": ["Cur"],
+        "deflection": ["Defl"],
+        "amplitude": ["Amp"],
+        "phase": ["Phas", "Phase"],
+        "frequency shift": ["Freq"],
+        "time": ["Time"],
+    },
+    towards=["ZSnsr", "Raw"],
+)
+"""Both ways are in the same columns, the approach first. Igor's files have the deflection, and no force."""
+
+
 class Asylum(ScriptedDriver[Session, AsylumActivity]):
     """The microscope behind Asylum Research's software.
 
@@ -87,6 +103,7 @@ class Asylum(ScriptedDriver[Session, AsylumActivity]):
     parameters_file = Path(__file__).with_name("parameters.toml")
     translated = (*NAMES, *POSITION, *_AT_FIRST, FEEDBACK_ON, names.ENGAGED, names.CONTROLLER)
     channel_roles = _CHANNELS
+    variable_roles = _VARIABLES
     maker: ClassVar[str] = "Oxford Instruments Asylum Research"
     software: ClassVar[str] = "Asylum Research in Igor Pro"
     counts_clockwise: ClassVar[bool] = True

@@ -35,6 +35,7 @@ from afspm.driver import (
     KeptSettings,
     Stated,
     Value,
+    VariableRoles,
     action,
     connected,
     frame,
@@ -87,6 +88,24 @@ _CHANNELS: Final = both_ways(
 )
 
 
+_VARIABLES: Final = VariableRoles.declared(
+    {
+        "bias": ["Bias-mon"],
+        "height": ["Z-mon"],
+        "current": ["CurrentSim1", "ADC0-I", "In 0"],
+        "current, retrace": ["Current Retrace"],
+        "conductance": ["dI/dV"],
+        "force": ["Force"],
+        "force, retrace": ["Force Retrace"],
+        "deflection": ["Deflection"],
+        "deflection, retrace": ["Deflection Retrace"],
+        "frequency shift": ["dFreq"],
+        "amplitude": ["Ampl", "McBSP Ampl"],
+        "excitation": ["Exec", "McBSP Exec"],
+    }
+)
+
+
 class Gxsm(Driver):
     """The driver of a microscope that GXSM controls.
 
@@ -107,6 +126,7 @@ class Gxsm(Driver):
     parameters_file = Path(__file__).with_name("parameters.toml")
     translated = (*FRAME, *CENTER, *POSITION, FEEDBACK_ON, names.CONTROLLER, *_AT_FIRST)
     channel_roles = _CHANNELS
+    variable_roles = _VARIABLES
     maker: ClassVar[str] = "Gxsm project"
     software: ClassVar[str] = "Gxsm"
     counts_clockwise: ClassVar[bool] = True

@@ -33,6 +33,7 @@ from afspm.driver import (
     ParameterSpec,
     Stated,
     Value,
+    VariableRoles,
     action,
     as_region,
     connected,
@@ -98,6 +99,31 @@ _CHANNELS: Final = both_ways(
 )
 
 
+_SIGNALS: Final = {
+    "current": ["Current"],
+    "conductance": ["dI/dV"],
+    "force": ["Force"],
+    "deflection": ["Deflection"],
+    "frequency shift": ["Frequency Shift", "OC M1 Freq. Shift"],
+    "amplitude": ["Amplitude", "OC M1 Amplitude", "OC D1 Amplitude"],
+    "phase": ["Phase", "OC M1 Phase", "OC D1 Phase"],
+    "excitation": ["Excitation", "OC M1 Excitation"],
+}
+_AVERAGE: Final = " [AVG]"
+"""Nanonis adds it to the names of signals where it saves single sweeps, too; their average then has the role."""
+_VARIABLES: Final = VariableRoles.declared(
+    {
+        "bias": ["Bias calc", "Bias", f"Bias{_AVERAGE}"],
+        "height": ["Z rel", "Z", f"Z{_AVERAGE}"],
+        **{role: [*those, *(name + _AVERAGE for name in those)] for role, those in _SIGNALS.items()},
+        **{
+            f"{role}, retrace": [f"{name} [bwd]{average}" for average in ("", _AVERAGE) for name in those]
+            for role, those in _SIGNALS.items()
+        },
+    }
+)
+
+
 class Nanonis(Driver):
     """The driver of a microscope with a Nanonis controller.
 
@@ -122,6 +148,7 @@ class Nanonis(Driver):
     parameters_file = Path(__file__).with_name("parameters.toml")
     translated = (*_TRANSLATED, *_AT_FIRST, names.CONTROLLER)
     channel_roles = _CHANNELS
+    variable_roles = _VARIABLES
     maker: ClassVar[str] = "SPECS Zurich"
     software: ClassVar[str] = "Nanonis"
     counts_clockwise: ClassVar[bool] = True

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.basics import ConfigError, Duration, PlainMapping, PollPeriod, Refused
-from afspm.driver import FRAME, POSITION, KeptSettings, ScriptedDriver, Value, action, frame
+from afspm.driver import FRAME, POSITION, KeptSettings, ScriptedDriver, Value, VariableRoles, action, frame
 from afspm.model import ControlResponse, ScanLines, ScopeState, both_ways, names
 from afspm.plugins.nanosurf import commands
 from afspm.plugins.nanosurf.activity import FORCE, NanosurfFiles, ScanTime, StudioActivity
@@ -51,6 +51,20 @@ _CHANNELS: Final = both_ways(
 )
 
 
+_VARIABLES: Final = VariableRoles.declared(
+    {
+        "bias": ["Tip voltage", "Bias"],
+        "height": ["Z", "Z-Axis", "Z-Axis Sensor"],
+        "current": ["Current", "Tip Current"],
+        "force": ["Force"],
+        "deflection": ["Deflection"],
+        "amplitude": ["Amplitude"],
+        "phase": ["Phase"],
+    }
+)
+"""Both ways are in the same columns, the approach first."""
+
+
 class Nanosurf(ScriptedDriver[Session, StudioActivity]):
     """The microscope behind Nanosurf Studio.
 
@@ -68,6 +82,7 @@ class Nanosurf(ScriptedDriver[Session, StudioActivity]):
     parameters_file = Path(__file__).with_name("parameters.toml")
     translated = (*FrameSettings.names, *Slopes.names, *POSITION, *_AT_FIRST, names.CONTROLLER)
     channel_roles = _CHANNELS
+    variable_roles = _VARIABLES
     maker: ClassVar[str] = "Nanosurf"
     software: ClassVar[str] = "Nanosurf Studio"
     program: ClassVar[str] = StudioActivity.program

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.basics import ConfigError, Duration, Length, PlainMapping, PollPeriod, Refused, lengths_text
-from afspm.driver import FRAME, POSITION, KeptSettings, LongCall, ScriptedDriver, Value, action, frame
+from afspm.driver import FRAME, POSITION, KeptSettings, LongCall, ScriptedDriver, Value, VariableRoles, action, frame
 from afspm.model import ControlResponse, Region, ScopeState, both_ways, names
 from afspm.plugins.park.activity import STOP, STOP_CURVE, SmartScanActivity
 from afspm.plugins.park.link import Link, SmartScanError
@@ -45,6 +45,18 @@ _CHANNELS: Final = both_ways(
 )
 
 
+_VARIABLES: Final = VariableRoles.declared(
+    {
+        "bias": ["Bias", "Sample Bias", "Tip Bias"],
+        "height": ["Z", "Z Height", "Z Drive", "Z Scan"],
+        "current": ["Current"],
+        "force": ["Force"],
+        "deflection": ["Deflection"],
+    }
+)
+"""Both ways are in the same columns, the approach first.  The heights grow away from the sample."""
+
+
 class Park(ScriptedDriver[Session, SmartScanActivity]):
     """The microscope behind SmartScan.
 
@@ -60,6 +72,7 @@ class Park(ScriptedDriver[Session, SmartScanActivity]):
     parameters_file = Path(__file__).with_name("parameters.toml")
     translated = (*FrameSettings.names, *Gains.names, *POSITION, *_AT_FIRST, names.CONTROLLER)
     channel_roles = _CHANNELS
+    variable_roles = _VARIABLES
     maker: ClassVar[str] = "Park Systems"
     software: ClassVar[str] = "SmartScan"
     program: ClassVar[str] = SmartScanActivity.program

@@ -16,6 +16,7 @@ from afspm.basics.errors import AfspmError, ConfigError, ErrorCollector, Refused
 from afspm.basics.plain_data import PlainMapping
 from afspm.basics.units import Duration, PollPeriod
 from afspm.model import ChannelRoles, ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.model.variables import VariableRoles
 from afspm.simulation import World
 from afspm.simulation.background import in_background
 from afspm.simulation.faults import INSTRUMENT_FAULTS, Fault, Faults
@@ -92,6 +93,17 @@ def _controller_action(
         do(self._reached(refuses=refuses), self.clock.now_s())
 
     return act
+
+
+_VARIABLES: Final = VariableRoles.declared(
+    {
+        "bias": ["Bias"],
+        "height": ["Z"],
+        "conductance": ["dI/dV"],
+        **{name.lower(): [name] for name in ("Current", "Deflection", "Force")},
+        **{f"{name.lower()}, retrace": [f"{name} Retrace"] for name in ("Current", "Deflection", "Force")},
+    }
+)
 
 
 class Simulator(Driver):
@@ -238,7 +250,7 @@ class Simulator(Driver):
             names |= {"amplitude": ["Amplitude"], "phase": ["Phase"]}
         if loop is not None and (loop.mode == "frequency-shift" or (loop.mode == "current" and loop.qplus)):
             names |= {"frequency shift": ["Frequency Shift"]}
-        return ChannelRoles.declared(names)
+        return ChannelRoles.declared(names, _VARIABLES)
 
     @classmethod
     def rows(cls, settings: PlainMapping) -> Rows:
