@@ -10,9 +10,9 @@ from afspm.basics import NoSuchItem, imports_of_extra, utc_time
 from afspm.basics.entry_points import DISPLAYS, required
 from afspm.basics.errors import InvalidValue
 from afspm.basics.plain_data import Plain
-from afspm.basics.units import convert, si_unit
+from afspm.basics.units import Number, convert, si_unit_or_none
 from afspm.model.geometry import XY, Frame
-from afspm.model.variables import FOUND_BY_NAME, HEIGHT, RETRACE, VariableRoles, turning_point
+from afspm.model.variables import BIAS, FOUND_BY_NAME, HEIGHT, RETRACE, VariableRoles, turning_point
 
 if TYPE_CHECKING:
     import numpy as np
@@ -85,34 +85,60 @@ class Spectrum:
                 from the sample; the swept variable of the way back has the order of the way back's points.
 
         Raises:
-            NoSuchItem: the curve has no such variable, or no way back.
+            NoSuchItem: the curve has no such variable, no way back, or its ways are not clear.
         """
         quantity = role.removesuffix(RETRACE)
         is_back = role != quantity
         there, back = (self.roles.column(one, self.names) for one in (quantity, quantity + RETRACE))
-        turn = turning_point(self.values[:, 0]) if back is None else None
+        known = [one for one in self.roles.roles_of(self.names) if one]
+        lacking = NoSuchItem(f"the curve has no {role!r}", hint=f"it has {', '.join(known)} ({', '.join(self.names)})")
+        if there is None and back is None:
+            raise lacking
+        has_own_way_back = any(one.endswith(RETRACE) for one in known)
+        swept, turn = self._sweep()
+        if has_own_way_back and turn is not None:
+            what = "the sweep turns, and columns of a way back stand beside it"
+            raise NoSuchItem(what, hint="take the columns by their names")
         # the swept variable has one column: the points of the way back, measured at the same time, have its values
-        is_swept = there is not None and there == self.names[0]
-        name = (back or (there if is_swept or turn is not None else None)) if is_back else there
-        if name is None or (is_back and is_swept and turn is None and not self._has_way_back):
-            known = [one for one in self.roles.roles_of(self.names) if one]
-            ways = [one + RETRACE for one in known if turn is not None]
-            raise NoSuchItem(
-                f"the curve has no {role!r}", hint=f"it has {', '.join([*known, *ways])} ({', '.join(self.names)})"
-            )
-        values = self[name]
+        shares = turn is not None or (has_own_way_back and there == swept)
+        name = (back or (there if shares else None)) if is_back else there
+        if name is None:
+            raise lacking
+        values = _in_si(self[name], self.units[self.names.index(name)])[0]
         if turn is not None:
             values = values[turn:] if is_back else values[:turn]
-        unit = self.units[self.names.index(name)]
-        values = convert(values, unit, si_unit(unit))
         return -values if quantity == HEIGHT and name in self.roles.towards else values
 
+    @property
+    def swept_role(self) -> str:
+        """Return the role of the swept variable; empty if it has none.
+
+        Raises:
+            NoSuchItem: no variable goes one way, or there and back.
+        """
+        name, _ = self._sweep()
+        return next((role for role in (BIAS, HEIGHT) if self.roles.column(role, self.names) == name), "")
+
+    def _sweep(self) -> tuple[str, int | None]:
+        # the swept variable, and where it turns: some makers have other columns before it
+        known = [name for role in (BIAS, HEIGHT) if (name := self.roles.column(role, self.names)) is not None]
+        found: dict[str, int | None] = {}
+        why = "nothing is measured"
+        for name in sorted(known, key=self.names.index) or self.names[:1]:
+            try:
+                found[name] = turning_point(self[name])
+            except NoSuchItem as error:
+                why = error.what
+        if len({*found.values()}) != 1:
+            several = f"{' and '.join(found)} turn at different points" if found else why
+            raise NoSuchItem(f"the ways of the curve are not clear: {several}", hint="take the columns by their names")
+        return next(iter(found.items()))
+
     def si_unit_of(self, role: str) -> str:
-        """Return the SI unit of a variable by its role, for the way there or back; empty if the curve has none."""
-        quantity = role.removesuffix(RETRACE)
-        found = (self.roles.column(one, self.names) for one in (role, quantity))
+        """Return the unit in which `of` gives a variable; empty if the curve has none."""
+        found = (self.roles.column(one, self.names) for one in (role, role.removesuffix(RETRACE)))
         name = next((one for one in found if one is not None), None)
-        return "" if name is None else si_unit(self.units[self.names.index(name)])
+        return "" if name is None else _in_si(1.0, self.units[self.names.index(name)])[1]
 
     def has(self, role: str) -> bool:
         """Return whether the curve has a variable that measures this."""
@@ -121,10 +147,6 @@ class Spectrum:
         except NoSuchItem:
             return False
         return True
-
-    @property
-    def _has_way_back(self) -> bool:
-        return any(one.endswith(RETRACE) for one in self.roles.roles_of(self.names))
 
     def to_xarray(self) -> xarray.Dataset:
         """Return an xarray Dataset over the first variable (needs the extra `xarray`)."""
@@ -147,3 +169,13 @@ class Spectrum:
 
     def _repr_html_(self) -> str:
         return str(required(DISPLAYS, "spectrum_html")(self))
+
+
+def _in_si(value: Number, unit: str) -> tuple[Number, str]:
+    # units that are no SI unit with a prefix ("arb", "dBm") stay; siemens are not taken apart
+    if unit.endswith("S") and (as_current := si_unit_or_none(f"{unit[:-1]}A")) == "A":
+        return convert(value, f"{unit[:-1]}A", as_current), "S"
+    base = si_unit_or_none(unit)
+    if base is None or " " in base:
+        return value, unit
+    return convert(value, unit, base), base

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
-from afspm.basics.errors import ConfigError
+from afspm.basics.errors import ConfigError, NoSuchItem
 
 if TYPE_CHECKING:
     from afspm.model.arrays import Array
@@ -29,8 +29,8 @@ VARIABLES: Final = (
     BIAS, HEIGHT, CURRENT, CONDUCTANCE, FORCE, "deflection", FREQUENCY_SHIFT, "amplitude", "phase", "excitation", TIME,
 )  # fmt: skip
 """What the variables of curves measure; each is a role for the way there, and with `RETRACE` for the way back."""
-_LEAST_TURN: Final = 0.5
-"""Least share of the sweep's range that both ways have to cover: noise of a one-way sweep turns, too."""
+_LEAST_TURN: Final = 0.05
+"""Least return of a sweep, as a share of its range: noise of a one-way sweep turns, too."""
 
 
 @dataclass(frozen=True)
@@ -108,17 +108,42 @@ def turning_point(swept: Array) -> int | None:
     """Return how many points a sweep has before it turns; None if it goes one way.
 
     Args:
-        swept: the values of the swept variable, point by point; NaN after a stop.
+        swept: the values of the swept variable, point by point; NaN after a stop. Where the way back is stored as a
+            second run in the same direction, the jump back to its beginning is the turn.
+
+    Raises:
+        NoSuchItem: the sweep turns more than once, as a loop or noise does, or has no range.
     """
     import numpy as np
 
-    measured = swept[np.isfinite(swept)]
-    if len(measured) < 4 or not (extent := float(np.ptp(measured))):
-        return None
-    low, high = int(np.argmin(measured)), int(np.argmax(measured))
-    # the turn is the extreme that is inside; at the other the sweep begins, ends, or both
-    for turn in (low, high):
-        before, after = abs(measured[turn] - measured[0]), abs(measured[turn] - measured[-1])
-        if 0 < turn < len(measured) - 1 and min(before, after) > _LEAST_TURN * extent:
-            return turn + 1
-    return None
+    points = np.flatnonzero(np.isfinite(swept))
+    values = swept[points]
+    extent = float(np.ptp(values)) if len(values) > 1 else 0.0
+    if not extent:
+        raise NoSuchItem("nothing is swept")
+    turns = _reversals(values.tolist(), _LEAST_TURN * extent)
+    if len(turns) == 2 and turns[1] == turns[0] + 1:  # a jump
+        turns = turns[:1]
+    if len(turns) > 1:
+        raise NoSuchItem(f"the sweep turns {len(turns)} times", hint="take the columns by their names")
+    return int(points[turns[0]]) + 1 if turns else None
+
+
+def _reversals(values: list[float], least: float) -> list[int]:
+    # the extremes after which the values return by more than `least`
+    found: list[int] = []
+    low = high = 0
+    rises: bool | None = None
+    for i, value in enumerate(values):
+        low, high = (i if value < values[low] else low), (i if value > values[high] else high)
+        if rises is not False and values[high] - value > least:
+            found += [high] if rises else []
+            rises, low = False, i
+        elif rises is not True and value - values[low] > least:
+            found += [low] if rises is False else []
+            rises, high = True, i
+        if rises:
+            low = i
+        elif rises is False:
+            high = i
+    return found

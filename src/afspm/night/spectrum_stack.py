@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from afspm.basics import imports_of_extra
 from afspm.basics.errors import InvalidValue
+from afspm.basics.units import convert
 from afspm.model.arrays import Array
 from afspm.model.geometry import Frame, Region
 from afspm.model.scan import Scan
@@ -139,11 +140,16 @@ def map_of(
         own_name = f"{quantity} at {swept:g} {first.units[0]}"
         number_of: Callable[[Spectrum], float] = partial(_value_at, quantity, swept, direction)
         if quantity.removesuffix(RETRACE) in VARIABLES:
+            if direction not in DIRECTIONS:
+                raise InvalidValue(f"nothing was measured {direction!r}", hint=f"there is {', '.join(DIRECTIONS)}")
             role = quantity if direction == DIRECTIONS[0] or quantity.endswith(RETRACE) else quantity + RETRACE
             if not first.has(role):
                 known = ", ".join(filter(None, first.roles.roles_of(first.names)))
                 raise InvalidValue(f"no {role!r} was measured", hint=f"there are {known} ({', '.join(first.names)})")
-            number_of, unit = partial(_value_of_role, role, swept), unit or first.si_unit_of(role)
+            own_unit = first.si_unit_of(role)
+            factor = convert(1.0, own_unit, unit) if unit else 1.0
+            number_of, unit = partial(_value_of_role, role, swept, factor), unit or own_unit
+            own_name = f"{quantity} at {swept:g} {first.si_unit_of(first.swept_role)}"
         unit = unit or _unit(first, quantity)
     else:
         own_name, number_of = getattr(quantity, "__name__", "map").replace("<lambda>", "map"), quantity
@@ -175,15 +181,16 @@ def _value_at(variable: str, value: float, direction: str, spectrum: Spectrum) -
     return _interpolated(value, swept, by_direction[direction][variable], f"{name} was swept", unit)
 
 
-def _value_of_role(role: str, value: float, spectrum: Spectrum) -> float:
-    swept_role = spectrum.roles.roles_of(spectrum.names)[0]
+def _value_of_role(role: str, value: float, factor: float, spectrum: Spectrum) -> float:
+    swept_role = spectrum.swept_role
     if not swept_role:
         raise InvalidValue(f"{spectrum.names[0]!r} has no known role", hint="give a function of the spectrum")
-    back = RETRACE if role.endswith(RETRACE) else ""
-    swept = spectrum.of(swept_role + back)
-    return _interpolated(
-        value, swept, spectrum.of(role), f"the {swept_role} was swept", spectrum.si_unit_of(swept_role)
-    )
+    swept, values = spectrum.of(swept_role + (RETRACE if role.endswith(RETRACE) else "")), spectrum.of(role)
+    measured = np.isfinite(swept) & np.isfinite(values)
+    if not measured.any():
+        return float("nan")
+    unit = spectrum.si_unit_of(swept_role)
+    return factor * _interpolated(value, swept[measured], values[measured], f"the {swept_role} was swept", unit)
 
 
 def _interpolated(value: float, swept: Array, values: Array, what: str, unit: str) -> float:

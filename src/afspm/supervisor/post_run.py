@@ -171,6 +171,8 @@ def report(folder: Path, log: RunLog) -> None:
         return
     except OSError as error:
         log.write(LOGGED_AS, logging.WARNING, f"no report: {error}")
+        if stop.came is not None:
+            signal.raise_signal(stop.came)
         return
     if exit_code:
         lines = output.decode(errors="replace").strip().splitlines()
@@ -194,17 +196,17 @@ class _Stop:
 
     def __init__(self) -> None:
         self._is_started = False
-        self._came: int | None = None
+        self.came: int | None = None
 
     def __call__(self, number: int) -> None:
         if self._is_started:
             raise _Stopped(number)
-        self._came = number
+        self.came = number
 
     def started(self) -> None:
         self._is_started = True
-        if self._came is not None:
-            raise _Stopped(self._came)
+        if self.came is not None:
+            raise _Stopped(self.came)
 
 
 def _until_done(command: Sequence[str], environment: Mapping[str, str], stop: _Stop) -> tuple[int, bytes]:

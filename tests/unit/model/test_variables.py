@@ -85,10 +85,53 @@ def test_experiment_file_adds_a_name() -> None:
         ([0, 1, 2, 1, 0], 3),
         ([2, 1, 0, 0, 1, 2], 3),
         ([0, 1, 2, 3, 2.9, 3.1], None),  # noise at the end of one way
-        ([1, 1, 1, 1], None),
         ([0, 1, np.nan, np.nan, np.nan], None),
+        ([0, np.nan, 2, 3, 4, 3, 2, 1, 0], 5),
         ([0, 1, 2, 0.9, np.nan], 3),
     ],
 )
 def test_sweep_turns_where_both_ways_cover_its_range(swept: list[float], turn: int | None) -> None:
     assert turning_point(np.array(swept, dtype=float)) == turn
+
+
+def test_sweep_is_found_behind_other_columns() -> None:
+    noise = np.random.default_rng(3).normal(size=2 * len(Z_M))
+    swept, force = np.r_[Z_M[::-1], Z_M], np.r_[THERE_N[::-1], BACK_N]
+    values = np.stack([noise, swept, force], axis=1)
+    found = Gxsm.channels_of({}).shown_curve(
+        Spectrum(None, "VP", ("Bias-mon", "Z-mon", "Force"), ("V", "m", "N"), values)
+    )
+    assert found.of("force, retrace") == pytest.approx(BACK_N)
+    assert found.swept_role == "height"
+
+
+@pytest.mark.parametrize(
+    "bias",
+    [
+        np.r_[0:1:20j, 1:-1:40j, -1:0:20j],  # three ways
+        np.random.default_rng(1).normal(size=50),
+        np.zeros(50),
+    ],
+)
+def test_curve_whose_ways_are_not_clear_gives_no_values(bias: np.ndarray) -> None:
+    unclear = Spectrum(None, "IV", ("Bias", "Current"), ("V", "A"), np.stack([bias, bias], axis=1))
+    with pytest.raises(NoSuchItem, match="ways of the curve are not clear"):
+        unclear.of("current")
+
+
+def test_way_back_may_be_shorter_or_stored_in_the_direction_of_the_way_there() -> None:
+    short = np.stack([np.r_[Z_M[::-1], Z_M[:20]], np.r_[THERE_N[::-1], BACK_N[:20]]], axis=1)
+    assert Spectrum(None, "force", ("Z", "Force"), ("m", "N"), short).of("force, retrace") == pytest.approx(BACK_N[:20])
+    again = np.stack([np.r_[Z_M, Z_M], np.r_[THERE_N, BACK_N]], axis=1)
+    found = Spectrum(None, "force", ("Z", "Force"), ("m", "N"), again)
+    assert found.of("force") == pytest.approx(THERE_N)
+    assert found.of("height, retrace") == pytest.approx(Z_M)
+
+
+@pytest.mark.parametrize(
+    ("unit", "si", "factor"), [("nS", "S", 1e-9), ("S", "S", 1.0), ("arb", "arb", 1.0), ("", "", 1.0)]
+)
+def test_unit_that_is_not_converted_stays(unit: str, si: str, factor: float) -> None:
+    found = Spectrum(None, "IV", ("Bias", "dI/dV"), ("mV", unit), np.stack([Z_M, Z_M], axis=1))
+    assert (found.si_unit_of("conductance"), found.si_unit_of("bias")) == (si, "V")
+    assert found.of("conductance") == pytest.approx(Z_M * factor)

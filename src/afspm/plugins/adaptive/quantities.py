@@ -62,6 +62,8 @@ def gap_ev(spectrum: Spectrum) -> float:
     Raises:
         NoSuchItem: the spectrum has no bias, or neither conductance nor current. InvalidValue: it shows no band edges.
     """
+    if (unit := spectrum.si_unit_of("bias")) not in ("V", ""):
+        raise InvalidValue(f"the bias is in {unit}")
     bias = spectrum.of("bias")
     order = np.argsort(bias)
     if spectrum.has("conductance"):
@@ -84,6 +86,8 @@ def adhesion_n(spectrum: Spectrum) -> float:
     Raises:
         NoSuchItem: the spectrum has no force, or no way back: the approach has its lowest force at the snap-in.
     """
+    if (unit := spectrum.si_unit_of("force, retrace")) != "N":
+        raise InvalidValue(f"the force is in {unit or 'no unit'}", hint="calibrate the cantilever at the controller")
     return -float(spectrum.of("force, retrace").min())
 
 

@@ -111,13 +111,16 @@ _SIGNALS: Final = {
 }
 _AVERAGE: Final = " [AVG]"
 """Nanonis adds it to the names of signals where it saves single sweeps, too; their average then has the role."""
+_BACK: Final = (" [bwd]", f"{_AVERAGE} [bwd]", f" [bwd]{_AVERAGE}")
 _VARIABLES: Final = VariableRoles.declared(
     {
         "bias": ["Bias calc", "Bias", f"Bias{_AVERAGE}"],
         "height": ["Z rel", "Z", f"Z{_AVERAGE}"],
         **{role: [*those, *(name + _AVERAGE for name in those)] for role, those in _SIGNALS.items()},
         **{
-            f"{role}, retrace": [f"{name} [bwd]{average}" for average in ("", _AVERAGE) for name in those]
+            f"{role}, retrace": [
+                f"{name}{way}" for way in (" [bwd]", f"{_AVERAGE} [bwd]", f" [bwd]{_AVERAGE}") for name in those
+            ]
             for role, those in _SIGNALS.items()
         },
     }

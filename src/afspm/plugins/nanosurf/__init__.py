@@ -60,7 +60,8 @@ _VARIABLES: Final = VariableRoles.declared(
         "deflection": ["Deflection"],
         "amplitude": ["Amplitude"],
         "phase": ["Phase"],
-    }
+    },
+    towards=["Z-Axis", "Z-Axis Sensor"],
 )
 """Both ways are in the same columns, the approach first."""
 

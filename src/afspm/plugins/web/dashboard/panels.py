@@ -25,7 +25,7 @@ from afspm.plugins.web.watch import Watch
 MOST_LINES = 300
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
 MOMENT, SCAN = "this moment", "the scan shown"
-_SHOWN = "return window.afspm.scansToNote()"
+_SHOWN = "return window.afspm?.scansToNote?.() ?? ['', '']"
 _EVERYTHING = "all"
 _BAD = {ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.GIVEN_UP}
 
