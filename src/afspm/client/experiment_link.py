@@ -104,9 +104,7 @@ class PublishedState:
 
     def with_roles(self, thing: Any) -> Any:
         """Return a scan, lines of one, or a curve with the roles of what it measures; any other thing unchanged."""
-        if isinstance(thing, Spectrum):
-            return self.channels.shown_curve(thing)
-        return self.channels.shown(thing) if isinstance(thing, Scan | ScanLines) else thing
+        return self.channels.shown(thing) if isinstance(thing, Scan | ScanLines | Spectrum) else thing
 
     def take_time(self, time_ns: int | None) -> None:
         """Update `newest_ns` with the time of a packet from the scheduler."""

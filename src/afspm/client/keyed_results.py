@@ -16,7 +16,7 @@ from afspm import wire
 from afspm.basics.errors import FileError, InvalidValue, WireError
 from afspm.basics.plain_data import Plain, from_json
 from afspm.model import LoggedPacket, MeasurementConditions, Note, Packet, Parameter, Scan, ScanSet, Spectrum
-from afspm.model.snapshot import to_plain
+from afspm.model.snapshot import from_plain, to_plain
 from afspm.model.variables import VariableRoles
 from afspm.storage.atomic import OutageLog, write_atomic
 from afspm.storage.disk import is_full
@@ -170,7 +170,7 @@ class KeyedResults:
             }
             curve = next((one for one in result.things if isinstance(one, Spectrum)), None)
             if curve is not None and curve.declared_roles is not None:
-                head["variables"] = {"names": dict(curve.declared_roles.names), "towards": curve.declared_roles.towards}
+                head["variables"] = to_plain(curve.declared_roles)
             if result.conditions is not None:
                 head["conditions"] = wire.encode(result.conditions)[1].hex()
             parts: list[bytes | memoryview] = []
@@ -220,8 +220,7 @@ def check_key(key: str) -> str:
 
 def _with_roles(thing: object, head: Plain) -> object:
     if isinstance(thing, Spectrum) and (kept := head.get("variables")) is not None:
-        names = {role: tuple(those) for role, those in kept["names"].items()}
-        return replace(thing, declared_roles=VariableRoles(names, tuple(kept["towards"])))
+        return replace(thing, declared_roles=from_plain(VariableRoles, kept))
     roles = head.get("roles", {})
     return replace(thing, roles=tuple(roles.get(thing.channel, ()))) if isinstance(thing, Scan) else thing
 

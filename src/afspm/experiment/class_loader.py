@@ -36,6 +36,9 @@ _DOORS = (
     "afspm.record",
     "afspm.components",
     "afspm.client",
+    "afspm.cli",
+    "afspm.supervisor",
+    "afspm.transport",
 )
 # Roles by the package of a base class: a user's class is recognised by its bases.
 _ROLE_BY_BASE = (

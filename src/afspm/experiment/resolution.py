@@ -188,9 +188,9 @@ def _check_variables(process: ResolvedProcess, component: type, document: Docume
     needed = getattr(component, "needed_variables", None)
     if needed is None or there.variables is None:
         return
-    for role in needed(process.settings):
-        if reason := there.variables.refuses(role):
-            what = f"[{process.name}] needs {role} in its curves: {reason}"
+    for roles in needed(process.settings):
+        if reason := there.variables.refuses(*roles):
+            what = f"[{process.name}] needs {' or '.join(roles)} in its curves: {reason}"
             hint = f"they have {', '.join(there.variables.names)}; [microscope.channels] gives further names"
             document.error(what, process.name, hint=hint)
 

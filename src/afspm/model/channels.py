@@ -33,6 +33,7 @@ _NO_LENGTHS: Final = (CURRENT, "phase", FREQUENCY_SHIFT, "excitation", "potentia
 ROLES: Final = (*QUANTITIES, *(quantity + RETRACE for quantity in QUANTITIES), TOPOGRAPHY)
 
 Measured = TypeVar("Measured", bound=Scan | ScanLines)
+Shown = TypeVar("Shown", bound=Scan | ScanLines | Spectrum)
 
 
 @dataclass(frozen=True)
@@ -96,14 +97,12 @@ class ChannelRoles:
         """Return the roles of a channel; empty without a role."""
         return tuple(role for role, names in self.names.items() if channel in names)
 
-    def shown(self, measured: Measured) -> Measured:
-        """Return a scan, or lines of one, with the roles of its channel."""
+    def shown(self, measured: Shown) -> Shown:
+        """Return a scan, or lines of one, with the roles of its channel; a spectrum with those of its variables."""
+        if isinstance(measured, Spectrum):
+            return measured if self.variables is None else replace(measured, declared_roles=self.variables)
         roles = self.of(measured.channel)
         return replace(measured, roles=roles) if roles else measured
-
-    def shown_curve(self, spectrum: Spectrum) -> Spectrum:
-        """Return a spectrum with the roles of its variables."""
-        return spectrum if self.variables is None else replace(spectrum, declared_roles=self.variables)
 
     def topography_first(self, channels: Iterable[str]) -> tuple[str, ...]:
         """Return channels as they are shown: the topography first, the others in their order."""

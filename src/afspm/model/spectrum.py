@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from datetime import datetime
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 from afspm.basics import NoSuchItem, imports_of_extra, utc_time
@@ -95,7 +96,7 @@ class Spectrum:
         if there is None and back is None:
             raise lacking
         has_own_way_back = any(one.endswith(RETRACE) for one in known)
-        swept, turn = self._sweep()
+        swept, turn = self._sweep
         if has_own_way_back and turn is not None:
             what = "the sweep turns, and columns of a way back stand beside it"
             raise NoSuchItem(what, hint="take the columns by their names")
@@ -116,9 +117,10 @@ class Spectrum:
         Raises:
             NoSuchItem: no variable goes one way, or there and back.
         """
-        name, _ = self._sweep()
-        return next((role for role in (BIAS, HEIGHT) if self.roles.column(role, self.names) == name), "")
+        name, _ = self._sweep
+        return self.roles.roles_of(self.names)[self.names.index(name)]
 
+    @cached_property
     def _sweep(self) -> tuple[str, int | None]:
         # the swept variable, and where it turns: some makers have other columns before it
         known = [name for role in (BIAS, HEIGHT) if (name := self.roles.column(role, self.names)) is not None]

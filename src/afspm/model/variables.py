@@ -72,18 +72,15 @@ class VariableRoles:
         found = {self.column(role, present): role for role in self.names}
         return [found.get(name, "") for name in present]
 
-    def refuses(self, role: str) -> str:
-        """Return why the microscope can't have a variable in its curves; empty if it may.
+    def refuses(self, *roles: str) -> str:
+        """Return why the microscope can't have a variable with one of these roles in its curves; empty if it may.
 
         Whether both ways are in one column is seen in the curves alone, so that the way back counts as there.
-
-        Args:
-            role: "conductance or current" needs one of the two.
         """
-        wanted = role.split(" or ")
-        if any(one in self.names or one.removesuffix(RETRACE) in self.names for one in wanted):
+        quantities = [role.removesuffix(RETRACE) for role in roles]
+        if not self.names.keys().isdisjoint((*roles, *quantities)):
             return ""
-        return f"its curves have no {role.replace(RETRACE, '')}"
+        return f"its curves have no {' or '.join(quantities)}"
 
 
 FOUND_BY_NAME: Final = VariableRoles.declared(

@@ -199,9 +199,7 @@ class RecordStore:
             case ScanLines() if self._about.measured:
                 self._write(self._gathering.lines(packet, self._placed(thing)))
             case Spectrum() if self._about.measured:
-                self._write(
-                    self._gathering.spectrum(packet, replace(self._roles.shown_curve(thing), frame=self._frame))
-                )
+                self._write(self._gathering.spectrum(packet, replace(self._roles.shown(thing), frame=self._frame)))
             case _:
                 self._add(packet, message, source, thing)
 

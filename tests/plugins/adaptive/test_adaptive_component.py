@@ -203,11 +203,18 @@ def test_adhesion_of_a_curve_is_proportional_to_the_one_of_the_map() -> None:
     assert ratio == pytest.approx(ratio[0], rel=0.05)
 
 
-def test_a_curve_without_a_gap_is_refused() -> None:
+def test_a_curve_without_the_quantity_is_refused() -> None:
     bias = np.linspace(-1.0, 1.0, 200)
     metal = Spectrum((0.0, 0.0), "IV", ("Bias", "dI/dV"), ("V", "S"), np.stack([bias, np.ones(200)], 1))
     with pytest.raises(InvalidValue, match="no band edge"):
         evaluation("gap").of(metal)
+    z = np.linspace(0.0, 1e-8, 9)
+    volts = Spectrum((0.0, 0.0), "force", ("Z", "Force", "Force Retrace"), ("m", "V", "V"), np.stack([z, z, z], 1))
+    with pytest.raises(InvalidValue, match="the force is in V"):
+        evaluation("adhesion").of(volts)
+    one_way = Spectrum((0.0, 0.0), "force", ("Z", "Force"), ("m", "N"), np.stack([z, z], 1))
+    with pytest.raises(InvalidValue, match="adhesion: the curve has no 'force, retrace'"):
+        evaluation("adhesion").of(one_way)
     other = Spectrum((0.0, 0.0), "force", ("Z", "Force"), ("m", "N"), np.zeros((9, 2)))
     with pytest.raises(InvalidValue, match="no 'bias'"):
         evaluation("gap").of(other)

@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
 import pytest
 from client_lab import REGION, SCAN_S, SOURCE, Kill9, Lab, LabPort
 from hypothesis import given, settings
@@ -16,6 +17,7 @@ from afspm import wire
 from afspm.basics.errors import ControlLost, InvalidValue, NoResponse, Refused
 from afspm.client.command_retry import LOST_AFTER_S, RETRY_S
 from afspm.client.experiment_link import ExperimentLink
+from afspm.client.keyed_results import KeyedResults, MeasurementResult
 from afspm.client.scope import Scope
 from afspm.model import (
     RELAY_REQUEST,
@@ -28,7 +30,9 @@ from afspm.model import (
     ResponseDetail,
     ScanSet,
     ScopeState,
+    Spectrum,
 )
+from afspm.model.variables import VariableRoles
 from afspm.scheduler.control.arbitration import ArbitrationEvent
 
 TILES = [REGION.moved_to((i * 2e-6, 0.0)) for i in range(3)]
@@ -206,6 +210,19 @@ def test_a_spectrum_with_a_key_is_taken_once(tmp_path: Path) -> None:
         lab.restart_component()
     assert lab.begun_scans == 1
     assert lab.count(ControlRequest.SET_PROBE_POS) == 1
+
+
+def test_saved_curve_keeps_the_roles_of_its_variables(tmp_path: Path) -> None:
+    roles = VariableRoles.declared({"force, retrace": ("F back",), "height": ("Z",)}, towards=("Z",))
+    values = np.array([[0.0, 1.0], [1e-9, 2.0]])
+    curve = Spectrum((0.0, 0.0), "force", ("Z", "F back"), ("m", "N"), values, 1, declared_roles=roles)
+    results = KeyedResults(tmp_path, "map")
+    results.fulfil("map-1", {}, MeasurementResult([curve], []))
+    results.close()
+    found = KeyedResults(tmp_path, "map").find("map-1", {})
+    assert found is not None
+    assert found.spectrum.declared_roles == roles
+    assert found.spectrum.of("height").tolist() == [0.0, -1e-9]
 
 
 def test_scan_after_a_timeout_is_taken_up_by_the_next_call(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ def curve(maker: str) -> Spectrum:
         names, units = ("Z", "Force"), ("nm", "N")
         values = np.stack([np.r_[Z_M[::-1], Z_M] * 1e9, np.r_[THERE_N[::-1], BACK_N]], axis=1)
     roles = DRIVERS[maker].channels_of({})
-    return roles.shown_curve(Spectrum(None, "force", names, units, values))
+    return roles.shown(Spectrum(None, "force", names, units, values))
 
 
 @pytest.mark.parametrize("maker", ["Simulator", "Nanonis", "Gxsm", "Park", "Nanosurf"])
@@ -51,7 +51,7 @@ def test_pull_off_is_the_same_on_each_maker(maker: str) -> None:  # spectra F0
 def test_height_of_asylum_is_turned_away_from_the_sample_and_has_no_force() -> None:
     extension = np.r_[Z_M[::-1], Z_M].max() - np.r_[Z_M[::-1], Z_M]
     values = np.stack([extension, np.r_[THERE_N[::-1], BACK_N] / 0.4, extension], axis=1)
-    found = Asylum.channels_of({}).shown_curve(Spectrum(None, "force", ("Raw", "Defl", "ZSnsr"), ("m",) * 3, values))
+    found = Asylum.channels_of({}).shown(Spectrum(None, "force", ("Raw", "Defl", "ZSnsr"), ("m",) * 3, values))
     assert np.all(np.diff(found.of("height")) < 0), "it approaches"
     assert np.all(np.diff(found.of("height, retrace")) > 0)
     assert found.of("deflection, retrace").min() == pytest.approx(BACK_N.min() / 0.4)
@@ -98,9 +98,7 @@ def test_sweep_is_found_behind_other_columns() -> None:
     noise = np.random.default_rng(3).normal(size=2 * len(Z_M))
     swept, force = np.r_[Z_M[::-1], Z_M], np.r_[THERE_N[::-1], BACK_N]
     values = np.stack([noise, swept, force], axis=1)
-    found = Gxsm.channels_of({}).shown_curve(
-        Spectrum(None, "VP", ("Bias-mon", "Z-mon", "Force"), ("V", "m", "N"), values)
-    )
+    found = Gxsm.channels_of({}).shown(Spectrum(None, "VP", ("Bias-mon", "Z-mon", "Force"), ("V", "m", "N"), values))
     assert found.of("force, retrace") == pytest.approx(BACK_N)
     assert found.swept_role == "height"
 

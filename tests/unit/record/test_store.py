@@ -35,8 +35,10 @@ from afspm.model import (
     ProcessStates,
     Scan,
     ScopeState,
+    Spectrum,
 )
 from afspm.model.events import LogLines
+from afspm.model.variables import VariableRoles
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.run_json import EXPERIMENT_FILE
 from afspm.record.store import _PROCESS, RecordSettings, RecordStore
@@ -83,6 +85,18 @@ def test_roles_of_channels_are_kept_and_the_topography_is_first(
         "Current",
     )
     assert run.about(run.scans[0])["channels"][0]["roles"] == ["height", "topography"]
+
+
+def test_roles_of_variables_are_kept_in_the_file(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    roles = VariableRoles.declared({"height": ("Z",), "force": ("F",), "force, retrace": ("F back",)}, towards=("Z",))
+    values = np.array([[0.0, 1.0, 2.0, 5.0], [1e-9, 3.0, 4.0, 6.0]])
+    curve = Spectrum((0.0, 0.0), "force", ("Z", "F", "F back", "Other"), ("m", "N", "N", "V"), values, night.now_ns)
+    store.take([night.packet(ChannelRoles({}, (), roles)), night.packet(curve, "Spec1d_force")])
+    run = afspm.open_run(tmp_path)
+    found = run.spectrum(run.spectra[0])
+    assert found.of("force, retrace").tolist() == [2.0, 4.0]
+    assert found.of("height").tolist() == [0.0, -1e-9]
+    assert not found.has("bias")
 
 
 def test_scan_recorded_without_roles_is_read(night: Night, store: RecordStore, tmp_path: Path) -> None:

@@ -135,7 +135,7 @@ class Adaptive(Component):
             self.scope.end_experiment()
 
     @classmethod
-    def needed_variables(cls, settings: Mapping[str, Any]) -> tuple[str, ...]:
+    def needed_variables(cls, settings: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:
         """Return the roles of variables that the quantity of these settings reads, for `afspm check`."""
         known = QUANTITIES.get(str(settings.get("quantity", "")))
         return () if known is None else known.needs

@@ -25,14 +25,14 @@ class Evaluation:
     """A quantity: its name and unit, the kind of spectrum that shows it (None: any), and the function of a spectrum.
 
     Attributes:
-        needs: the roles of the variables that the function reads; "conductance or current": one of them.
+        needs: the roles of the variables that the function reads; of several in one tuple it reads one.
     """
 
     name: str
     unit: str
     kind: str | None
     function: Callable[[Spectrum], float]
-    needs: tuple[str, ...] = ()
+    needs: tuple[tuple[str, ...], ...] = ()
 
     def of(self, spectrum: Spectrum) -> float:
         """Return the value of the quantity in a spectrum.
@@ -66,12 +66,11 @@ def gap_ev(spectrum: Spectrum) -> float:
         raise InvalidValue(f"the bias is in {unit}")
     bias = spectrum.of("bias")
     order = np.argsort(bias)
+    bias = bias[order]
     if spectrum.has("conductance"):
-        bias, conductance = bias[order], spectrum.of("conductance")[order]
+        conductance = spectrum.of("conductance")[order]
     else:
-        current = spectrum.of("current")[order]
-        bias = bias[order]
-        conductance = np.gradient(current, bias)
+        conductance = np.gradient(spectrum.of("current")[order], bias)
     width = max(1, len(bias) // 50)
     smoothed = np.convolve(conductance, np.full(width, 1.0 / width), mode="same")
     lowest = width + int(np.argmin(smoothed[width : len(bias) - width]))
@@ -86,14 +85,15 @@ def adhesion_n(spectrum: Spectrum) -> float:
     Raises:
         NoSuchItem: the spectrum has no force, or no way back: the approach has its lowest force at the snap-in.
     """
+    force = spectrum.of("force, retrace")
     if (unit := spectrum.si_unit_of("force, retrace")) != "N":
         raise InvalidValue(f"the force is in {unit or 'no unit'}", hint="calibrate the cantilever at the controller")
-    return -float(spectrum.of("force, retrace").min())
+    return -float(force.min())
 
 
 QUANTITIES: Final = {
-    "gap": Evaluation("gap", "eV", "IV", gap_ev, ("bias", "conductance or current")),
-    "adhesion": Evaluation("adhesion", "N", "force", adhesion_n, ("force, retrace",)),
+    "gap": Evaluation("gap", "eV", "IV", gap_ev, (("bias",), ("conductance", "current"))),
+    "adhesion": Evaluation("adhesion", "N", "force", adhesion_n, (("force, retrace",),)),
 }
 
 

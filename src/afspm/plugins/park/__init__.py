@@ -54,7 +54,7 @@ _VARIABLES: Final = VariableRoles.declared(
         "deflection": ["Deflection"],
     }
 )
-"""Both ways are in the same columns, the approach first.  The heights grow away from the sample."""
+"""Both ways are in the same columns, the approach first. The heights grow away from the sample."""
 
 
 class Park(ScriptedDriver[Session, SmartScanActivity]):
