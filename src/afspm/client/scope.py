@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypedDict, Unpack
 
 from afspm import wire
 from afspm.basics import RequestError
@@ -17,12 +18,13 @@ from afspm.client.control_hold import ControlHold
 from afspm.client.events import Events, PublishedEvent
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.experiment_view import ExperimentView, checked_call
+from afspm.client.former_values import FormerValues, Steps
 from afspm.client.instrument_targets import InstrumentTargets
 from afspm.client.keyed_results import KeyedResults, check_key
 from afspm.client.measurement import MeasurementRunner
 from afspm.client.measurement_setup import MeasurementSetup
 from afspm.client.parameter_text import Value, to_parameter, value_in
-from afspm.client.sweeping import ParameterSweep, SweepPoint
+from afspm.client.sweeping import ParameterSweep, SweepPoint, values_between
 from afspm.client.targets import ScanTarget, SpectrumTarget, xy_of
 from afspm.model import (
     CLOCK_REQUEST,
@@ -47,6 +49,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
+from afspm.model.curve_request import CurveSettings, curve_parameters
 from afspm.model.events import HasTime
 from afspm.model.instruments import InstrumentOrders, newest_of
 from afspm.model.sessions import KEYED
@@ -59,6 +62,16 @@ Place = tuple[float | str, float | str]
 SET_BACK_WITHIN_S = 60.0
 """Limit on the wait for control after a failed sweep, real time."""
 ANSWER_S = 60.0  # default of readings; calls that wait for control or a measurement have no limit by default
+
+
+class CurveArguments(TypedDict, total=False):
+    """What a request for one spectrum may say of the curve: see `curve_parameters`."""
+
+    sweep: tuple[str, str]
+    points: int
+    point_time: float | str
+    z_offset: float | str
+    lock_in: Mapping[str, float | str]
 
 
 class Scope(ExperimentView):
@@ -94,6 +107,7 @@ class Scope(ExperimentView):
     ) -> None:
         super().__init__(link, problems or ProblemNames(), between)
         self._frame = frame
+        self._curve: tuple[Parameter, ...] = ()
         self._begun: tuple[int, float] | None = None  # finished parts and time at the first `progress`
         self._control = ControlHold(link, self.problems)
         self._commands = CommandRetry(link, self._control)
@@ -139,16 +153,74 @@ class Scope(ExperimentView):
         kind: str | None = None,
         key: str | None = None,
         timeout_s: float | None = None,
+        **curve: Unpack[CurveArguments],
     ) -> Spectrum:
         """Take a spectrum; interruptions and `key` as for `scan`.
+
+            scope.spectrum(("0 nm", "5 nm"), kind="IV", sweep=("-500 mV", "500 mV"), points=201)
 
         Args:
             at: (x, y) in m or as text, ("1 um", "0 nm"), to move the probe to; None: the present position.
             kind: e.g. "IV" (the parameter `x-spec-kind`); None: the present kind.
+            curve: settings of the curve, which are set back after it: `sweep`, `points`, `point_time`, `z_offset` and
+                `lock_in`, as in `curve_parameters`. For many curves, use `curves`.
         """
+        if curve:
+            with self.curves(curve, kind=kind, key=key, timeout_s=timeout_s):
+                return self.spectrum(at, kind=kind, key=key, timeout_s=timeout_s)
         with self._call():
-            target = SpectrumTarget.of(at, kind, self._frame)
+            target = SpectrumTarget.of(at, kind, self._frame, self._curve)
             return self._runner.take(target, key, self._link.until(timeout_s)).spectrum
+
+    @contextmanager
+    def curves(
+        self,
+        settings: CurveSettings,
+        *,
+        kind: str | None = None,
+        key: str | None = None,
+        timeout_s: float | None = None,
+    ) -> Iterator[None]:
+        """Take all spectra of the block with these settings, and set the former values back at its end.
+
+            with scope.curves({"sweep": ("-500 mV", "500 mV"), "points": 201}, kind="IV"):
+                for number, place in enumerate(places):
+                    scope.spectrum(place, kind="IV", key=f"curve-{number}")
+
+        Others may get control between two spectra. So the settings are set before each, and limits judge them each
+        time. As for `sweep`, nothing is set back after the end of the experiment or a stop of the process; with a key,
+        a restarted component does so at the end of the same block.
+
+        Args:
+            settings: as in `curve_parameters`; without any, nothing is set.
+            kind: kind of the spectra, since each may have settings of its own; None: the present kind.
+            key: name of the block.
+        """
+        of_curves, outside = curve_parameters(settings), self._curve
+        first = None if kind is None else Parameter(names.SPEC_KIND, kind)
+        former = self._former([one.name for one in of_curves], key and check_key(key), first=first)
+        if of_curves:
+            until_s = self._link.until(timeout_s)
+            with self._call(), self._control.hold(until_s=until_s):
+                former.remember(until_s)
+        self._curve = (*outside, *of_curves)
+        try:
+            with self._setting_back(former, timeout_s):
+                yield
+        finally:
+            self._curve = outside
+
+    def _former(
+        self,
+        parameters: Sequence[str],
+        key: str | None,
+        steps: Steps = lambda now, before: (),
+        first: Parameter | None = None,
+    ) -> FormerValues:
+        return FormerValues(
+            parameters, key, link=self._link, control=self._control, commands=self._commands, targets=self._targets,
+            results=self._results, steps=steps, first=first,
+        )  # fmt: skip
 
     @checked_call
     @contextmanager
@@ -196,24 +268,16 @@ class Scope(ExperimentView):
             raise InvalidValue(f"a sweep can't measure {measure!r}", where="sweep", hint='"scan" or "spectrum"')
         plan = SweepPlan.of(parameters, order, seed)
         target = (
-            ScanTarget.of(region, shape, self._frame) if measure == "scan" else SpectrumTarget.of(at, kind, self._frame)
+            ScanTarget.of(region, shape, self._frame)
+            if measure == "scan"
+            else SpectrumTarget.of(at, kind, self._frame, self._curve)
         )
-        sweep = ParameterSweep(
-            plan, target, key and check_key(key), link=self._link, control=self._control, commands=self._commands,
-            targets=self._targets, runner=self._runner, results=self._results,
-        )  # fmt: skip
+        key = key and check_key(key)
+        former = self._former([axis.name for axis in plan.axes], key, partial(values_between, plan))
+        sweep = ParameterSweep(plan, target, key, former, runner=self._runner, results=self._results)
         until_s = self._link.until(timeout_s)
-        with self._control.hold(until_s=until_s, keeps=True):
-            try:
-                yield self._each_in_a_call(sweep.points(done, until_s))
-            except (ExperimentEnded, StopRequested):
-                self._log_left_behind(sweep)
-                raise
-            except BaseException:  # also Ctrl-C, and what the block of the user raises
-                with suppress(RequestError):  # logged; the first error says more
-                    self._set_back(sweep, SET_BACK_WITHIN_S)
-                raise
-            self._set_back(sweep, timeout_s)
+        with self._control.hold(until_s=until_s, keeps=True), self._setting_back(former, timeout_s):
+            yield self._each_in_a_call(sweep.points(done, until_s))
 
     def _each_in_a_call(self, points: Iterator[SweepPoint]) -> Iterator[SweepPoint]:
         while True:
@@ -223,17 +287,30 @@ class Scope(ExperimentView):
                 return
             yield point
 
-    def _set_back(self, sweep: ParameterSweep, timeout_s: float | None) -> None:
+    @contextmanager
+    def _setting_back(self, former: FormerValues, timeout_s: float | None) -> Iterator[None]:
+        try:
+            yield
+        except (ExperimentEnded, StopRequested):
+            self._log_left_behind(former)
+            raise
+        except BaseException:  # also Ctrl-C, and what the block of the user raises
+            with suppress(RequestError):  # logged; the first error says more
+                self._set_back(former, SET_BACK_WITHIN_S)
+            raise
+        self._set_back(former, timeout_s)
+
+    def _set_back(self, former: FormerValues, timeout_s: float | None) -> None:
         try:
             with self._call():
-                sweep.set_back(self._link.until(timeout_s))
+                former.set_back(self._link.until(timeout_s))
         except (RequestError, ExperimentEnded, StopRequested):
-            self._log_left_behind(sweep)
+            self._log_left_behind(former)
             raise
 
-    def _log_left_behind(self, sweep: ParameterSweep) -> None:
-        if sweep.left_behind:
-            self._link.log.warning("a sweep ended before its parameters were set back to %s", sweep.left_behind)
+    def _log_left_behind(self, former: FormerValues) -> None:
+        if former.left_behind:
+            self._link.log.warning("the run ended before parameters were set back to %s", former.left_behind)
 
     @checked_call
     def forget(self, key: str) -> None:

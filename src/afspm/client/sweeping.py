@@ -1,4 +1,4 @@
-"""A sweep of parameters: set them at each point, take a scan or spectrum, and set them back at the end."""
+"""A sweep of parameters: set them at each point, and take a scan or spectrum."""
 
 from __future__ import annotations
 
@@ -6,17 +6,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from afspm import wire
-from afspm.basics.errors import Refused, UnitError
+from afspm.basics.errors import UnitError
 from afspm.basics.units import convert
-from afspm.client.command_retry import CommandRetry, refused
-from afspm.client.control_hold import ControlHold
-from afspm.client.experiment_link import ExperimentLink
-from afspm.client.instrument_targets import InstrumentTargets
+from afspm.client.former_values import FormerValues
 from afspm.client.keyed_results import KeyedResults, MeasurementResult
 from afspm.client.measurement import MeasurementRunner
 from afspm.client.targets import Target
-from afspm.model import ControlRequest, MeasurementConditions, Parameter, ScanSet, Spectrum, is_of_instrument
+from afspm.model import MeasurementConditions, Parameter, ScanSet, Spectrum
 from afspm.model.sweep_plan import SweepAxis, SweepPlan, SweptValue
 
 
@@ -61,14 +57,12 @@ class SweepPoint:
 
 
 class ParameterSweep:
-    """A sweep in progress, which measures each point of a plan and then sets the parameters back.
-
-    With a key the original values are saved on disk: after a restart of the component the sweep goes on with the next
-    point, and still sets the parameters back to the original values.
+    """A sweep in progress, which measures each point of a plan.
 
     Args:
         target: scan or spectrum to take at each point.
         key: key of the sweep; its measurements have the keys "<key>-1", "<key>-2" …
+        former: remembers the values before the first point.
     """
 
     def __init__(
@@ -76,98 +70,37 @@ class ParameterSweep:
         plan: SweepPlan,
         target: Target,
         key: str | None,
+        former: FormerValues,
         *,
-        link: ExperimentLink,
-        control: ControlHold,
-        commands: CommandRetry,
-        targets: InstrumentTargets,
         runner: MeasurementRunner,
         results: KeyedResults,
     ) -> None:
-        self._plan, self._target, self._key = plan, target, key
-        self._link, self._control, self._commands, self._targets = link, control, commands, targets
+        self._plan, self._target, self._key, self._former = plan, target, key, former
         self._runner, self._results = runner, results
-        self._before = None if key is None else results.before_sweep(key)
 
     def points(self, done: int, until_s: float | None) -> Iterator[SweepPoint]:
         """Measure and yield each point, except the first `done`. Raises as `MeasurementRunner.take`."""
         for index, places in list(enumerate(self._plan.places()))[done:]:
             key = None if self._key is None else f"{self._key}-{index + 1}"
-            target = replace(self._target, settings=self._plan.settings(places))
+            target = replace(self._target, settings=(*self._target.settings, *self._plan.settings(places)))
             result = None if key is None else self._results.find(key, target.facts())
             if result is None:
-                if self._before is None:
-                    self._keep(self._read(until_s))
+                self._former.remember(until_s)
                 result = self._runner.take(target, key, until_s)
             in_force = _shown(self._plan, result.conditions)
             yield SweepPoint(index + 1, self._plan.total, key or "", self._plan.values(places), in_force, result)
 
-    def set_back(self, until_s: float | None) -> None:
-        """Set the parameters to their values before the sweep; a value that the microscope refuses is logged.
 
-        Other instruments get their targets from before; nothing waits until they have arrived.
-
-        Raises:
-            ControlLost, NoResponse: the parameters are not set back by `until_s`. A later call can still do so, with a
-                key even after a restart.
-        """
-        if self._before is None:
-            return
-        is_back = True
-        with self._control.hold(until_s=until_s):
-            for parameter in reversed(self._before):
-                try:
-                    self._set_back(parameter, until_s)
-                except Refused as error:
-                    is_back = False
-                    text = "%s stays as the sweep has set it, and is not set back to %s: %s"
-                    self._link.log.error(text, parameter.name, _amount(parameter), error.what)
-            self._commands.publish_settings((), "")
-        self._keep(None)
-        if is_back:
-            self._link.log.info("the parameters are set back")
-
-    def _set_back(self, before: Parameter, until_s: float | None) -> None:
-        try:
-            self._commands.set_parameter(before, until_s)
-        except Refused:
-            # a limit on steps may refuse the whole way, and allow the steps of the sweep
-            between = self._values_between(self._in_force(before.name, until_s), before)
-            if not between:
-                raise
-            for parameter in (*between, before):
-                self._commands.set_parameter(parameter, until_s)
-
-    def _values_between(self, now: Parameter, before: Parameter) -> list[Parameter]:
-        axis = next(axis for axis in self._plan.axes if axis.name == before.name)
-        ends = [_number(one, axis.unit) for one in (now, before)]
-        if None in ends or axis.in_steps() is axis:  # texts or switches have no order
-            return []
-        low, high = sorted(end for end in ends if end is not None)
-        places = [place for place, value in enumerate(axis.values) if low < float(value) < high]
-        places.sort(key=lambda place: float(axis.values[place]), reverse=ends[0] == high)
-        return [axis.parameter(place) for place in places]
-
-    @property
-    def left_behind(self) -> str:
-        """Return the parameter values from before the sweep that are not in force again, as text; empty if all are."""
-        return ", ".join(map(_text, self._before or ()))
-
-    def _read(self, until_s: float | None) -> list[Parameter]:
-        return [self._in_force(axis.name, until_s) for axis in self._plan.axes]
-
-    def _in_force(self, name: str, until_s: float | None) -> Parameter:
-        if is_of_instrument(name):
-            return self._targets.in_force(name, until_s)
-        response = self._commands.read(ControlRequest.PARAM, Parameter(name), until_s)
-        if not response.ok:
-            raise refused(ControlRequest.PARAM, response, name)
-        return wire.decode_parameter(response.payload)
-
-    def _keep(self, before: list[Parameter] | None) -> None:
-        self._before = before
-        if self._key is not None:
-            self._results.keep_before_sweep(self._key, before)
+def values_between(plan: SweepPlan, now: Parameter, before: Parameter) -> list[Parameter]:
+    """Return the values of a plan between the present value of a parameter and the one before the sweep, in order."""
+    axis = next(axis for axis in plan.axes if axis.name == before.name)
+    ends = [_number(one, axis.unit) for one in (now, before)]
+    if None in ends or axis.in_steps() is axis:  # texts or switches have no order
+        return []
+    low, high = sorted(end for end in ends if end is not None)
+    places = [place for place, value in enumerate(axis.values) if low < float(value) < high]
+    places.sort(key=lambda place: float(axis.values[place]), reverse=ends[0] == high)
+    return [axis.parameter(place) for place in places]
 
 
 def _shown(plan: SweepPlan, conditions: MeasurementConditions | None) -> dict[str, ValueInForce]:
@@ -184,14 +117,6 @@ def _value(given: Mapping[str, Parameter], axis: SweepAxis) -> SweptValue | None
     if isinstance(axis.values[0], bool):
         return parameter.value == "true"
     return parameter.value if isinstance(axis.values[0], str) else _number(parameter, axis.unit)
-
-
-def _text(parameter: Parameter) -> str:
-    return f"{parameter.name} {_amount(parameter)}"
-
-
-def _amount(parameter: Parameter) -> str:
-    return " ".join(filter(None, (parameter.value, parameter.unit)))
 
 
 def _number(parameter: Parameter, unit: str | None) -> float | None:

@@ -89,7 +89,11 @@ class ScanTarget:
 
 @dataclass(frozen=True)
 class SpectrumTarget:
-    """A spectrum to take; None keeps the present kind or position of the probe. `settings` as in `ScanTarget`."""
+    """A spectrum to take; None keeps the present kind or position of the probe.
+
+    Attributes:
+        settings: parameters of the curve or of a sweep, set before each attempt.
+    """
 
     at_m: XY | None
     kind: str | None
@@ -103,8 +107,8 @@ class SpectrumTarget:
     message: ClassVar = "Spec1d"
 
     @classmethod
-    def of(cls, at_m: object, kind: str | None, frame: Frame) -> SpectrumTarget:
-        return cls(None if at_m is None else xy_of(at_m), kind, frame)
+    def of(cls, at_m: object, kind: str | None, frame: Frame, settings: tuple[Parameter, ...] = ()) -> SpectrumTarget:
+        return cls(None if at_m is None else xy_of(at_m), kind, frame, settings)
 
     def facts(self) -> Plain:
         """Return the target in JSON's types, so that the component recognises it after a restart."""

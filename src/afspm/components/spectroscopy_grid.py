@@ -14,6 +14,7 @@ from afspm.components.pace import Pace
 from afspm.components.planned_scans import pair
 from afspm.components.scan_plan import XY, RefusedPlaces, grid_centers
 from afspm.model import names
+from afspm.model.curve_request import CurveTable, curve_parameters
 from afspm.model.planned_work import PlannedWork
 
 MOST_LINES = 20
@@ -34,6 +35,8 @@ class SpectroscopyGrid(Component):
         angle: angle of the grid, counter-clockwise; by default 0.
         positions: a list of (x, y) instead of a grid.
         kind: kind of spectrum, if the microscope has several, e.g. "IV" or "force".
+        curve: settings of the curves, as in `curve_parameters`: {sweep = ["-500 mV", "500 mV"], points = 201,
+            lock_in = {amplitude = "10 mV"}}; set back at the end.
         repeats: number of spectra at each point.
         end_when_done: whether to end the whole experiment after the last spectrum.
     """
@@ -48,6 +51,7 @@ class SpectroscopyGrid(Component):
         angle: Angle | None = None,
         positions: list[tuple[Length, Length]] | None = None,
         kind: str | None = None,
+        curve: CurveTable | None = None,
         repeats: int = 1,
         end_when_done: bool = False,
     ) -> None:
@@ -72,7 +76,13 @@ class SpectroscopyGrid(Component):
         if repeats < 1:
             raise ConfigError(f"{repeats} is not at least 1", where="repeats")
         self.kind = kind
-        self.needs_parameters = (names.PROBE_POS_X, names.PROBE_POS_Y, *([names.SPEC_KIND] if kind else []))
+        self.curve = curve or {}
+        self.planned_parameters = {"curve": curve_parameters(self.curve)}
+        of_curves = (one.name for one in self.planned_parameters["curve"])
+        self.needs_parameters = (
+            *(names.PROBE_POS_X, names.PROBE_POS_Y, *([names.SPEC_KIND] if kind else [])),
+            *of_curves,
+        )
         self.repeats = repeats
         self.end_when_done = end_when_done
 
@@ -81,6 +91,14 @@ class SpectroscopyGrid(Component):
         return PlannedWork(spectra=spectra, ends_experiment=self.end_when_done, why=why)
 
     def run(self) -> None:
+        with self.scope.curves(self.curve, kind=self.kind, key="curve"):
+            refused = self._measure()
+        if refused:
+            self.log.error("%d of %d spectra were refused", refused, len(self.positions) * self.repeats)
+        if self.end_when_done:
+            self.scope.end_experiment()
+
+    def _measure(self) -> int:
         total = len(self.positions) * self.repeats
         pace = Pace(self.scope, self.memory)
         refusals = RefusedPlaces(len(self.positions), self.memory)
@@ -102,10 +120,7 @@ class SpectroscopyGrid(Component):
             if self.memory.save(synced=False):  # if not saved, a restart requests the same spectrum
                 self.scope.forget(key)
             self.scope.progress(done, total, left_s=pace.left_s(done, total))
-        if refusals.number:
-            self.log.error("%d of %d spectra were refused", refusals.number, total)
-        if self.end_when_done:
-            self.scope.end_experiment()
+        return refusals.number
 
     def _leave_out(self, at_m: XY, refused: Refused) -> None:
         message = f"the position {position_text(at_m)} is left out: {refused.reason}"

@@ -33,6 +33,7 @@ from afspm.model import (
     names,
     registration_summary,
 )
+from afspm.model.curve_request import CurveTable, curve_parameters
 from afspm.model.geometry import XY
 from afspm.model.planned_work import PlannedWork, planned_rounds
 from afspm.record import drift_knowledge
@@ -68,6 +69,7 @@ class Survey(Component):
         curves: places of curves, by name: a pair is an offset (x, y) from the target; a length is a distance, at which
             the lowest place of the zoom is taken; 0 is the target itself, e.g. {top = "0 nm", beside = "150 nm"}.
         kind: kind of the curves, if the microscope has several, e.g. "IV" or "force".
+        curve: settings of the curves, as for a `SpectroscopyGrid`: {sweep = ["-500 mV", "500 mV"], points = 201}.
         count: largest number of targets to visit.
         center: (x, y) of the middle of the survey.
         angle: angle of survey and zooms, counter-clockwise.
@@ -99,6 +101,7 @@ class Survey(Component):
         zoom: Length | tuple[Length, Length],
         curves: dict[str, Length | tuple[Length, Length]] | None = None,
         kind: str | None = None,
+        curve: CurveTable | None = None,
         count: int = 10,
         center: tuple[Length, Length] = (0.0, 0.0),
         angle: Angle = 0.0,
@@ -129,6 +132,8 @@ class Survey(Component):
         self.placed_later = {"zoom": ScanParameters(closer.moved_to(wide.center_m), self._closer.shape)}
         half_m = min(self._closer.region.size_m) / 2
         self.curves = {name: _place(name, place, half_m) for name, place in (curves or {}).items()}
+        self.curve = curve or {}
+        self.planned_parameters = {"curve": curve_parameters(self.curve)}
         self.kind, self.channel, self.end_when_done, self.file = kind, channel, end_when_done, file
         if targets is not None:
             for name, value in {"min_height": min_height, "separation": separation}.items():
@@ -149,7 +154,8 @@ class Survey(Component):
         probe: tuple[str, ...] = ()
         if self.curves:
             self.needs_actions = (names.START_SCAN, names.START_SPEC)
-            probe = (names.PROBE_POS_X, names.PROBE_POS_Y, *((names.SPEC_KIND,) if self.kind else ()))
+            of_curves = (one.name for one in self.planned_parameters["curve"])
+            probe = (names.PROBE_POS_X, names.PROBE_POS_Y, *((names.SPEC_KIND,) if self.kind else ()), *of_curves)
         self.needs_parameters = (*FRAME, *probe, *parameters)
 
     def check(self) -> None:
@@ -166,8 +172,13 @@ class Survey(Component):
         return replace(work, at_most=True, ends_experiment=self.end_when_done)
 
     def run(self) -> None:
-        with self.scope.events(MAPPING, timeout_s=0.0) as mappings:
+        with (
+            self.scope.curves(self.curve, kind=self.kind, key="curve"),
+            self.scope.events(MAPPING, timeout_s=0.0) as mappings,
+        ):
             self._run(mappings)
+        if self.end_when_done:
+            self.scope.end_experiment()
 
     def _run(self, mappings: Events) -> None:
         self._set(self._wide.parameters)
@@ -194,8 +205,6 @@ class Survey(Component):
             assert self._refused is not None
             self.log.error("no target could be zoomed: all %d were refused", len(visits))
             raise self._refused
-        if self.end_when_done:
-            self.scope.end_experiment()
 
     def on_end(self) -> None:
         if self._record is None:

@@ -18,6 +18,7 @@ from afspm.components.pace import Pace
 from afspm.components.planned_scans import FRAME, Pixels, pair, shape_of
 from afspm.components.scan_plan import ScanPlan
 from afspm.model import Parameter, Region, names
+from afspm.model.curve_request import CurveTable, curve_parameters
 from afspm.model.instruments import is_of_instrument
 from afspm.model.planned_work import PlannedWork, planned_rounds
 from afspm.model.snapshot import to_plain
@@ -53,6 +54,7 @@ class Sweep(Component):
         pixels: (columns, rows) of the scans; by default the present numbers.
         at: (x, y) of the spectra; by default where the probe stands.
         kind: kind of the spectra, where the microscope can choose, e.g. "IV" or "force".
+        curve: settings of the spectra, as for a `SpectroscopyGrid`: {sweep = ["-500 mV", "500 mV"], points = 201}.
         end_when_done: whether to end the whole experiment after the last point.
     """
 
@@ -68,13 +70,14 @@ class Sweep(Component):
         pixels: Pixels | None = None,
         at: tuple[Length, Length] | None = None,
         kind: str | None = None,
+        curve: CurveTable | None = None,
         end_when_done: bool = False,
     ) -> None:
         self.sweep, self.measure, self.end_when_done = _plan(parameters, order, seed), measure, end_when_done
         self.kind = kind
         self._given: Plain = {"parameters": parameters, "order": order, "seed": seed}
         of_scans = {"size": size, "center": center, "angle": angle, "pixels": pixels}
-        for name, value in ({"at": at, "kind": kind} if measure == "scan" else of_scans).items():
+        for name, value in ({"at": at, "kind": kind, "curve": curve} if measure == "scan" else of_scans).items():
             if value is not None:
                 raise ConfigError(f"says nothing of a {measure}", where=name)
         for name, value in {"center": center, "angle": angle}.items():
@@ -84,12 +87,15 @@ class Sweep(Component):
         shape = None if pixels is None else shape_of(pixels)
         self._frame = region, shape
         self._what = {"region": region, "shape": shape} if measure == "scan" else {"at": at and pair(at), "kind": kind}
+        self.curve = curve or {}
+        self._of_curves = curve_parameters(self.curve)
         self.needs_actions = (names.START_SCAN if measure == "scan" else names.START_SPEC,)
         fixed = (
             *((*FRAME, names.SCAN_ANGLE) if size else ()),
             *(_PIXELS if pixels else ()),
             *(_PROBE if at else ()),
             *((names.SPEC_KIND,) if kind else ()),
+            *(one.name for one in self._of_curves),
         )
         for axis in self.sweep.axes:
             if axis.name in fixed:
@@ -102,9 +108,10 @@ class Sweep(Component):
 
     @property
     def planned_parameters(self) -> dict[str, tuple[Parameter, ...]]:
-        """All values that the sweep sets, under its setting `parameters`, for comparison with the limits."""
+        """All values that the sweep sets, by the setting that gives them, for comparison with the limits."""
         return {
-            "parameters": tuple(axis.parameter(place) for axis in self.sweep.axes for place in range(len(axis.values)))
+            "curve": self._of_curves,
+            "parameters": tuple(axis.parameter(place) for axis in self.sweep.axes for place in range(len(axis.values))),
         }
 
     def planned_work(self, speed_m_s: float | None) -> PlannedWork:
@@ -136,7 +143,10 @@ class Sweep(Component):
         self.memory.save()
         if 0 < done < total:
             self.log.info("going on with point %d of %d", done + 1, total)
-        with self.scope.sweep(**self._given, **self._what, measure=self.measure, key=KEY, done=done) as points:
+        with (
+            self.scope.curves(self.curve, kind=self.kind, key="curve"),
+            self.scope.sweep(**self._given, **self._what, measure=self.measure, key=KEY, done=done) as points,
+        ):
             for point in points:
                 self.memory["done"] = point.number
                 pace.note()

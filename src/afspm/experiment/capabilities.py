@@ -95,6 +95,7 @@ def base() -> dict[str, str | None]:
         names.CRASH_SPEED: "m/s",
         names.CRASH_DEPTH: "m",
         names.SPEC_KIND: None,
+        **names.OF_CURVES,
         # without a unit at most makers; a limit with another one is an error, rather than never compared
         **dict.fromkeys((names.ZCTRL_PGAIN, names.ZCTRL_IGAIN), ""),
     }

@@ -56,7 +56,7 @@ from afspm.scheduler.safety.rule_language import RuleComparison, RuleError, Rule
 Quantity = str | float
 _QUANTITIES: Final = ("min", "max", "step", "rate")
 _OF_ACTION: Final = ("only", "every")
-_OF_PARAMETER: Final = (*_QUANTITIES, *_OF_ACTION)
+_OF_PARAMETER: Final = (*_QUANTITIES, *_OF_ACTION, "unseen_sweeps")
 Pair = tuple[Length, Length]
 _FORBID: Final = ("limits", "forbid")
 _EXAMPLE: Final = "abs(tip-bias-voltage) > 1 V and zctrl-setpoint > 100 pA"
@@ -132,12 +132,13 @@ class LimitsReader:
         if not isinstance(actions, Mapping):
             self.document.error("[limits] actions is not a table", "limits", "actions")
             actions = {}
+        read = {name: limit for name, keys in parameters.items() if (limit := self._parameter(name, keys))}
         limits = ExperimentLimits(
-            parameters={name: limit for name, keys in parameters.items() if (limit := self._parameter(name, keys))},
+            parameters=read,
             actions={name: limit for name, keys in actions.items() if (limit := self._action(name, keys))},
             **self._bounds(whole, table),
             sets={action: parameters for action, parameters in self.sets.items() if parameters},
-            roles=self._roles(table.get("roles", {})),
+            roles=self._roles(table.get("roles", {}), read),
             forbid=self._forbid(table.get("forbid", [])),
         )
         self._check_sizes(limits)
@@ -296,13 +297,13 @@ class LimitsReader:
         hint = nearest(name, [*known, *STATES])
         raise RuleError(f"there is no parameter, instrument's parameter or state {name!r}", at, hint)
 
-    def _roles(self, table: object) -> dict[str, RoleLimits]:
+    def _roles(self, table: object, limits: Mapping[str, Limit]) -> dict[str, RoleLimits]:
         if not isinstance(table, Mapping):
             self.document.error("[limits] roles is not a table", "limits", "roles")
             return {}
-        return {name: self._role(name, role) for name, role in table.items()}
+        return {name: self._role(name, role, limits) for name, role in table.items()}
 
-    def _role(self, name: str, table: object) -> RoleLimits:
+    def _role(self, name: str, table: object, limits: Mapping[str, Limit]) -> RoleLimits:
         path = ("limits", "roles", name)
         if component_of(name) not in self.components:
             what, near = f"[limits.roles] there is no component {component_of(name)!r}", component_of(name)
@@ -310,6 +311,7 @@ class LimitsReader:
         plain = dict(table) if isinstance(table, Mapping) else {}
         given = parse(RoleSection, ".".join(path), plain, self.document, path)
         ranges = {name: self._range(name, pair, path) for name, pair in (given.parameters or {}).items()}
+        unseen = {name for name, limit in limits.items() if limit.unseen_sweeps}
         places: list[tuple[str, tuple[str | int, ...]]] = [
             *((action, ("actions", number)) for number, action in enumerate(given.actions or ())),
             *((action, ("per_hour", action)) for action in given.per_hour or ()),
@@ -323,7 +325,11 @@ class LimitsReader:
         source = str(self.document.place(*path))
         return RoleLimits(
             ExperimentLimits(
-                parameters={parameter: limit for parameter, limit in ranges.items() if limit is not None},
+                parameters={
+                    parameter: replace(limit, unseen_sweeps=parameter in unseen)
+                    for parameter, limit in ranges.items()
+                    if limit is not None
+                },
                 region=None if given.region is None else self._region(given.region, path),
                 region_source=source,
             ),

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         both_ways,
         of_role,
     )
+    from afspm.model.curve_request import CurveTable, curve_parameters
     from afspm.model.events import (
         LONGEST_NOTE,
         PERSON,
@@ -118,6 +119,7 @@ __all__ = [
     "ControlRequest",
     "ControlResponse",
     "ControlState",
+    "CurveTable",
     "Feedback",
     "Frame",
     "Grant",
@@ -167,6 +169,7 @@ __all__ = [
     "TipStatus",
     "both_ways",
     "component_of",
+    "curve_parameters",
     "is_of_instrument",
     "names",
     "of_role",
@@ -179,6 +182,7 @@ if not TYPE_CHECKING:
         __name__,
         {
             "afspm.model.channels": "HEIGHT_RETRACE TOPOGRAPHY ChannelName ChannelRoles both_ways of_role",
+            "afspm.model.curve_request": "CurveTable curve_parameters",
             "afspm.model.events": (
                 "LONGEST_NOTE PERSON ControlEvent JournalEntries JournalEntry LogLine Note "
                 "ProcessCondition ProcessState ProcessStates Progress RelayedMessage Role component_of"

@@ -74,6 +74,37 @@ CRASH_SPEED: Final = "x-crash-speed"
 CRASH_DEPTH: Final = "x-crash-depth"
 SPEC_KIND: Final = "x-spec-kind"
 
+# A curve: the ends of its sweep, its points, and the lock-in amplifier.
+SPEC_FROM: Final = "x-spec-from"
+SPEC_TO: Final = "x-spec-to"
+SPEC_Z_FROM: Final = "x-spec-z-from"
+SPEC_Z_TO: Final = "x-spec-z-to"
+SPEC_ENDS: Final = (SPEC_FROM, SPEC_TO)
+"""First and last bias of a curve that sweeps the bias."""
+SPEC_Z_ENDS: Final = (SPEC_Z_FROM, SPEC_Z_TO)
+"""First and last height of a curve that sweeps the height: 0 where the feedback is opened, positive away from the
+sample."""
+SPEC_POINTS: Final = "x-spec-points"
+SPEC_POINT_TIME: Final = "x-spec-point-time"
+SPEC_Z_OFFSET: Final = "x-spec-z-offset"
+"""Height at which the bias is swept, counted as `SPEC_Z_ENDS`."""
+LOCK_IN_AMPLITUDE: Final = "x-lock-in-amplitude"
+"""Amplitude of the modulation of the bias: its peak, not its root mean square."""
+LOCK_IN_FREQUENCY: Final = "x-lock-in-frequency"
+OF_CURVES: Final = {
+    **dict.fromkeys(SPEC_ENDS, "V"),
+    **dict.fromkeys(SPEC_Z_ENDS, "m"),
+    SPEC_POINTS: "",
+    SPEC_POINT_TIME: "s",
+    SPEC_Z_OFFSET: "m",
+    LOCK_IN_AMPLITUDE: "V",
+    LOCK_IN_FREQUENCY: "Hz",
+}
+"""The parameters of curves with their SI units."""
+SWEEPS_BIAS: Final = frozenset({"IV", "dI/dV", "df(V)"})
+SWEEPS_HEIGHT: Final = frozenset({"force", "I(z)", "df(z)"})
+"""Kinds of curves by the swept quantity; others, such as a maker's vector programs, may sweep any."""
+
 FEEDBACK_ON: Final = "x-feedback-on"
 ON_WORDS: Final = frozenset({"true", "1", "on", "yes"})
 OFF_WORDS: Final = frozenset({"false", "0", "off", "no"})

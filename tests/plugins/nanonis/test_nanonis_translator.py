@@ -567,6 +567,36 @@ def test_measured_value_is_compared_within_the_resolution_of_its_row(bench: Make
     )
 
 
+# --- what a curve sweeps ---
+
+
+def test_settings_of_a_curve_are_those_of_its_module(bench: Make) -> None:
+    made = bench()
+    peer = made.start()
+    ready(peer)
+    sweeps = made.emulator.software.spectra.sweeps
+    asked = {
+        "x-spec-from": ("-500", "mV"), "x-spec-to": ("0.25", "V"), "x-spec-points": ("64", ""),
+        "x-spec-point-time": ("2", "ms"), "x-spec-z-offset": ("-50", "pm"),
+        "x-lock-in-amplitude": ("10", "mV"), "x-lock-in-frequency": ("797", "Hz"),
+    }  # fmt: skip
+    for name, (value, unit) in asked.items():
+        assert peer.set(name, value, unit).ok, name
+    assert sweeps["BiasSpectr"].limits == pytest.approx((-0.5, 0.25))
+    assert (sweeps["BiasSpectr"].points, sweeps["ZSpectr"].points) == (64, None)
+    registers = made.emulator.software.core.registers
+    assert registers.get("BiasSpectr.Timing")[1] == pytest.approx(-50e-12)
+    assert registers.get("BiasSpectr.Timing")[5] == pytest.approx(2e-3)
+    assert registers.got("LockIn.ModAmpGet", (1,)) == (pytest.approx(0.01),)
+    assert peer.set(names.SPEC_KIND, "force").ok
+    assert float(peer.get("x-spec-points")) != 64.0
+    for name, number in {"x-spec-z-from": 20e-9, "x-spec-z-to": -1e-9, "x-spec-points": 32}.items():
+        assert peer.set(name, number, names.OF_CURVES[name]).ok, name
+    assert registers.get("ZSpectr.Range") == pytest.approx((20e-9, -21e-9))
+    assert (sweeps["BiasSpectr"].points, sweeps["ZSpectr"].points) == (64, 32)
+    assert float(peer.get("x-spec-z-to")) == -1e-9
+
+
 # --- at the panel ---
 
 

@@ -190,7 +190,7 @@ def test_a_value_that_can_not_be_set_back_is_logged(caplog: pytest.LogCaptureFix
     lab.intercept = limit
     sweep(scope_of(lab))
     assert lab.in_force == ("0.2", BEFORE[1])
-    assert "tip-bias-voltage stays as the sweep has set it, and is not set back to 0.5 V" in caplog.text
+    assert "tip-bias-voltage stays as it was set, and is not set back to 0.5 V" in caplog.text
     assert "only below 0.3 V" in caplog.text
     assert "the parameters are set back" not in caplog.text
 

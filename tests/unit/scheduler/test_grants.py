@@ -767,8 +767,16 @@ def test_part_of_a_place_is_refused_with_the_cure(agent: AgentLab, kind: int, su
 def test_spectrum_at_the_edge_of_a_grant_is_allowed(agent: AgentLab) -> None:
     agent.begin(agent.grant(counts=(GrantedCount(names.START_SPEC, 1),)))
     assert agent.do(int(ControlRequest.SET_PROBE_POS), ProbePosition((0.0, 0.999 * UM))) == ""
-    agent.in_force = {"probe_pos_y": str(0.999 * UM)}
+    curve = {"x_spec_kind": "IV", "x_spec_from": "-0.5", "x_spec_to": "0.5"}
+    agent.in_force = {"probe_pos_y": str(0.999 * UM), **curve}
     assert agent.do(ACTION, names.START_SPEC) == ""
+
+
+def test_curve_beyond_the_range_of_a_grant_is_refused(agent: AgentLab) -> None:
+    agent.begin(agent.grant(counts=(GrantedCount(names.START_SPEC, 1),)))
+    assert agent.do(int(ControlRequest.SET_PROBE_POS), ProbePosition((0.0, 0.0))) == ""
+    agent.in_force = {"x_spec_kind": "IV", "x_spec_from": "-0.5", "x_spec_to": "0.6"}
+    assert "x-spec-to = 600 mV is above the highest allowed, 500 mV" in agent.do(ACTION, names.START_SPEC)
 
 
 def test_value_with_a_unit_is_outside_a_range_whose_unit_is_unknown(agent: AgentLab) -> None:

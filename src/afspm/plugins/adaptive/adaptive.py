@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Final
 from afspm import Component
 from afspm.basics import Angle, ConfigError, Length, MeasurementFailed, counted, quantity
 from afspm.components import OutageLog, PlannedWork, write_atomic
-from afspm.model import Region, names
+from afspm.model import CurveTable, Region, curve_parameters, names
 from afspm.plugins.adaptive.mapping import (
     MOST_SPECTRA,
     MapProgress,
@@ -51,6 +51,7 @@ class Adaptive(Component):
         angle: angle of the region, counter-clockwise.
         unit: unit of the result of your own function.
         kind: kind of the spectra; by default the kind of the quantity, or the kind set at the microscope.
+        curve: settings of the spectra, as for a `SpectroscopyGrid`: {sweep = ["-500 mV", "500 mV"], points = 201}.
         optimizer: "adaptive", "nested" (complete lattices), or a function of region and quantity as "module.name" that
             returns an optimiser with `suggest` and `ingest` of bluesky-adaptive, with the parameters `x` and `y`.
         coarsest: number of positions along the longer side of the first lattice, 3 to 9.
@@ -74,6 +75,7 @@ class Adaptive(Component):
         angle: Angle = 0.0,
         unit: str = "",
         kind: str | None = None,
+        curve: CurveTable | None = None,
         optimizer: str = "adaptive",
         coarsest: int = 5,
         levels: int = 5,
@@ -90,7 +92,10 @@ class Adaptive(Component):
         self._optimizer = optimizer_of(optimizer, self._region, self._evaluation.name, **own)
         self.kind = self._evaluation.kind
         with_kind = (names.SPEC_KIND,) if self.kind else ()
-        self.needs_parameters = (names.PROBE_POS_X, names.PROBE_POS_Y, *with_kind)
+        self.curve = curve or {}
+        self.planned_parameters = {"curve": curve_parameters(self.curve)}
+        of_curves = (one.name for one in self.planned_parameters["curve"])
+        self.needs_parameters = (names.PROBE_POS_X, names.PROBE_POS_Y, *with_kind, *of_curves)
         self.positions = tuple((float(x), float(y)) for x, y in self._region.corners_m())
         self.end_when_done, self.file = end_when_done, file
         self._progress: MapProgress | None = None
@@ -102,6 +107,12 @@ class Adaptive(Component):
         )
 
     def run(self) -> None:
+        with self.scope.curves(self.curve, kind=self.kind, key="curve"):
+            self._measure()
+        if self.end_when_done:
+            self.scope.end_experiment()
+
+    def _measure(self) -> None:
         found = MapProgress(self._optimizer, self._region, self._evaluation, self._until, self.clock.late)
         self._progress = found
         kept = [MeasuredPoint(**row) for row in self.memory.setdefault("measured", [])]
@@ -131,8 +142,6 @@ class Adaptive(Component):
         self.log.info("%s: %s%s", self._state(found), why, self._failures(found))
         if failed and not found.measured:
             raise MeasurementFailed(f"none of the {len(failed)} positions of the map gave a value")
-        if self.end_when_done:
-            self.scope.end_experiment()
 
     @classmethod
     def needed_variables(cls, settings: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:

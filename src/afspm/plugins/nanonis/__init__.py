@@ -82,7 +82,16 @@ _BY_VALUE: Final = (
     parameter_groups.MoveSpeed,
 )
 _SIDE: Final = (parameter_groups.Slope, parameter_groups.DriftRate, parameter_groups.SafeTip)
-_GROUPS: Final = (*_BY_VALUE, *_SIDE, geometry.Probe, parameter_groups.FeedbackOn, parameter_groups.TipState)
+_OF_CURVES: Final = (parameter_groups.SweptBias, parameter_groups.SweptHeight, parameter_groups.LockIn)
+_GROUPS: Final = (
+    *_BY_VALUE,
+    *_SIDE,
+    *_OF_CURVES,
+    parameter_groups.CurvePoints,
+    geometry.Probe,
+    parameter_groups.FeedbackOn,
+    parameter_groups.TipState,
+)
 _TRANSLATED: Final = tuple(name for group in _GROUPS for name in group.names)
 _CHANNELS: Final = both_ways(
     {
@@ -202,7 +211,9 @@ class Nanonis(Driver):
         self._tip = parameter_groups.TipState(ask, lambda: self.log)
         self._side = [parameter_groups.SideGroup(group(ask)) for group in _SIDE]
         vital = (*(group(ask) for group in _BY_VALUE), self._probe, feedback, self._tip, self._kept)
-        self.groups = (*vital, *self._side)
+        of_curves = [group(ask) for group in _OF_CURVES]
+        points = parameter_groups.CurvePoints(ask, lambda: MODULES[str(self._kept[names.SPEC_KIND])])
+        self.groups = (*vital, *self._side, *of_curves, points)
         self._preamplifier = Preamplifier(ask, preamplifier_range)
         self._tip_shaper = TipShaper(ask, sensor, qplus_bias, lambda: self.log)
         self._files: NanonisFiles

@@ -292,3 +292,90 @@ class DriftRate(Group):
     def _with_limit(self, found: tuple[Any, ...]) -> tuple[Any, ...]:
         # release 2021 has no limit
         return found if len(found) > _DRIFT_WITHOUT_LIMIT else (*found, self._usual_limit_percent)
+
+
+class SweptBias(Group):
+    """First and last bias of bias spectroscopy."""
+
+    names = names.SPEC_ENDS
+
+    def read(self) -> dict[str, Value]:
+        return dict(zip(self.names, self._numbers("BiasSpectr.LimitsGet"), strict=True))
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        merged = self.merged(values)
+        self._ask("BiasSpectr.LimitsSet", *(float(merged[name]) for name in self.names))
+
+
+class SweptHeight(Group):
+    """First and last height of z spectroscopy: Nanonis has the offset of the first, and the way from there."""
+
+    names = names.SPEC_Z_ENDS
+
+    def read(self) -> dict[str, Value]:
+        offset_m, way_m = self._numbers("ZSpectr.RangeGet")
+        return dict(zip(self.names, (offset_m, offset_m + way_m), strict=True))
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        first_m, last_m = (float(self.merged(values)[name]) for name in self.names)
+        self._ask("ZSpectr.RangeSet", first_m, last_m - first_m)
+
+
+class CurvePoints(Group):
+    """The number of points of a curve, and the time to measure each, for the kind of curve in force.
+
+    Args:
+        module: returns the module of this kind.
+    """
+
+    names = (names.SPEC_POINTS, names.SPEC_POINT_TIME, names.SPEC_Z_OFFSET)
+    _points_at: ClassVar = {"BiasSpectr": 3, "ZSpectr": 1}
+    _time_at: ClassVar = {"BiasSpectr": 5, "ZSpectr": 4}
+    _offset_at: ClassVar = 1  # of BiasSpectr.TimingGet
+
+    def __init__(self, ask: Ask, module: Callable[[], str]) -> None:
+        super().__init__(ask)
+        self._module = module
+
+    def read(self) -> dict[str, Value]:
+        module = self._module()
+        points = self._ask(f"{module}.PropsGet")[self._points_at[module]]
+        timing = self._ask(f"{module}.TimingGet")  # not `_numbers`: the slew rate may be infinite
+        found = (points, timing[self._time_at[module]])
+        if module == "BiasSpectr":
+            return dict(zip(self.names, (*found, timing[self._offset_at]), strict=True))
+        return dict(zip(self.names, (*found, self._numbers("ZSpectr.RangeGet")[0]), strict=True))
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        module, no_change = self._module(), 0
+        if module == "ZSpectr" and names.SPEC_Z_OFFSET in values:
+            raise refuse_value(names.SPEC_Z_OFFSET, f"a curve of the height begins at {names.SPEC_Z_FROM}: set that")
+        timing = list(self._ask(f"{module}.TimingGet"))
+        if names.SPEC_POINT_TIME in values or names.SPEC_Z_OFFSET in values:
+            timing[self._time_at[module]] = float(values.get(names.SPEC_POINT_TIME, timing[self._time_at[module]]))
+            if module == "BiasSpectr":
+                timing[self._offset_at] = float(values.get(names.SPEC_Z_OFFSET, timing[self._offset_at]))
+            self._ask(f"{module}.TimingSet", *timing)
+        if names.SPEC_POINTS in values:
+            points = int(values[names.SPEC_POINTS])
+            if module == "BiasSpectr":
+                # no value of the offset means no change
+                rest = (points, timing[self._offset_at], no_change, no_change)
+                self._ask("BiasSpectr.PropsSet", no_change, no_change, no_change, *rest)
+            else:
+                self._ask("ZSpectr.PropsSet", no_change, points, no_change, no_change, no_change, no_change)
+
+
+class LockIn(Group):
+    """Amplitude and frequency of the first modulator of the lock-in amplifier."""
+
+    names = (names.LOCK_IN_AMPLITUDE, names.LOCK_IN_FREQUENCY)
+    _functions: ClassVar = dict(zip(names, ("LockIn.ModAmp", "LockIn.ModPhasFreq"), strict=True))
+    _first: ClassVar = 1
+
+    def read(self) -> dict[str, Value]:
+        return {name: self._numbers(f"{function}Get", self._first)[0] for name, function in self._functions.items()}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        for name, value in values.items():
+            self._ask(f"{self._functions[name]}Set", self._first, float(value))

@@ -579,7 +579,7 @@ class GrantChecker:
             if action in names.AT_PROBE and placed.probe_m is not None:
                 placing = Request(_SET_PROBE, ProbePosition(placed.probe_m))
             refusal = LimitChecker(limits).check(who, placing, now_ns)
-            refusal = refusal or LimitChecker(limits, state).check_treatment(request)
+            refusal = refusal or LimitChecker(limits, state).check_values(request)
             return "" if refusal is None else refusal.reason
         if others := _others(request, limits):
             return f"the grant does not include {others[0]}"
@@ -667,5 +667,5 @@ def _outside(
         checker = replace(checker, state=state)
         # A place is known in the coordinates of the microscope, which are the same without a frame. With a frame the
         # microscope is moved to the place that the agent has set, which was checked then.
-        refusal = checker.check_place(request) if offset_m is None else checker.check_treatment(request)
+        refusal = checker.check_place(request) if offset_m is None else checker.check_values(request)
     return "" if refusal is None else refusal.reason

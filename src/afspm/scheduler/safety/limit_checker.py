@@ -20,7 +20,7 @@ from typing import NamedTuple
 from afspm.basics.errors import InvalidValue
 from afspm.basics.formatting import lengths_text, position_text, quantity
 from afspm.basics.frozen import replace
-from afspm.basics.units import si_unit_or_none
+from afspm.basics.units import convert, si_unit_or_none
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -61,7 +61,8 @@ _TREATMENTS = {
     names.CRASH: (names.CRASH_DEPTH, names.CRASH_SPEED),
 }
 """The parameters that a treatment of the tip uses as they are in force."""
-_OF_TREATMENTS = frozenset(name for parameters in _TREATMENTS.values() for name in parameters)
+_ENDS = frozenset((*names.SPEC_ENDS, *names.SPEC_Z_ENDS))
+_READ_FOR_ACTIONS = _ENDS.union(*_TREATMENTS.values())
 
 
 class _Breach(Exception):
@@ -112,7 +113,8 @@ class LimitChecker:
         return None
 
     def check_place(self, request: Request) -> Response | None:
-        """Return the refusal of an action at the present place, or of a treatment as it is set; None: it may start.
+        """Return the refusal of an action at the present place, or of a treatment or curve as it is set; None: it may
+        start.
 
         A person may have changed both.
         """
@@ -120,10 +122,15 @@ class LimitChecker:
             self._check_place(str(request.subject))
         except _Breach as breach:
             return _action_error(request, breach)
-        return self.check_treatment(request)
+        return self.check_values(request)
 
-    def check_treatment(self, request: Request) -> Response | None:
-        """Return the refusal of a treatment of the tip with the values in force; None: it may start."""
+    def check_values(self, request: Request) -> Response | None:
+        """Return the refusal of a treatment of the tip or a curve with the values in force; None: it may start."""
+        if request.subject == names.START_SPEC and request.kind == ControlRequest.ACTION:
+            try:
+                self._check_curve()
+            except _Breach as breach:
+                return _action_error(request, breach)
         for name in _TREATMENTS.get(str(request.subject), ()):
             limit, known = self.limits.parameters.get(name), self.state.usage.known.get(name)
             if limit is None or known is None:
@@ -169,6 +176,8 @@ class LimitChecker:
             limited = self.limits.parameters
             of_action = _TREATMENTS.get(str(request.subject), ())
             needed += [name for name in of_action if name in limited and limited[name].is_of_a_number]
+            if request.subject == names.START_SPEC:
+                needed += self._ends_to_read()
         if self.limits.region is not None or is_mapped:
             action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
             for place, actions in _PLACES:
@@ -198,7 +207,7 @@ class LimitChecker:
 
     def seen(self, values: Iterable[Parameter]) -> LimitChecker:
         """Store the last known values of quantities in forbidden states."""
-        wanted = frozenset[str]().union(*(rule.names for rule in self.limits.forbid.values()))
+        wanted = frozenset({names.SPEC_KIND}).union(*(rule.names for rule in self.limits.forbid.values()))
         new = {value.name: value for value in values if value.name in wanted}
         if not new:
             return self
@@ -215,7 +224,7 @@ class LimitChecker:
         for name, value in numbers_read.items():
             if value is None:
                 usage = usage.forget(name)
-            elif name in self.limits.bounded or name in _OF_TREATMENTS:
+            elif name in self.limits.bounded or name in _READ_FOR_ACTIONS:
                 usage = usage.learn(name, value, now_ns, was_read=True)
         read = self.seen(value for value in values.values() if value is not None)
         return read._with_state(usage, self.state.position.was_read(numbers_read))
@@ -342,7 +351,7 @@ class LimitChecker:
 
     def _number(self, reported: Parameter) -> float | None:
         limits = self.limits.parameters
-        if reported.name in _OF_TREATMENTS and reported.name not in limits:
+        if reported.name in _READ_FOR_ACTIONS and reported.name not in limits:
             # in SI, for the ranges of roles and grants
             limits = {reported.name: Limit(unit=si_unit_or_none(reported.unit or ""))}
         try:
@@ -382,6 +391,8 @@ class LimitChecker:
                 self._check_use(use, name, limit, "parameter")
             if limit is not None and value is not None:
                 self._check_value(name, value, limit, use.now_ns)
+            if name in names.SPEC_ENDS and value is not None:
+                self._check_bias(name, value)
 
     def _set_by(self, request: Request) -> Collection[object]:
         # an action of the experiment file sets parameters at the microscope
@@ -413,6 +424,48 @@ class LimitChecker:
             raise _param_error(f"{setting} is below the lowest allowed, {text(limit.low)} ({limit.source})")
         if limit.high is not None and value > limit.high + abs(limit.high) * reach:
             raise _param_error(f"{setting} is above the highest allowed, {text(limit.high)} ({limit.source})")
+
+    def _check_bias(self, name: str, volts: float, reach: float = _REACH) -> None:
+        # an end of a sweep of the bias, by the range of the bias itself
+        limit = self.limits.parameters.get(names.TIP_BIAS_VOLTAGE)
+        own = self.limits.parameters.get(name)
+        if limit is not None and limit.has_range:
+            of_bias = limit.unit or "V"
+            value = float(convert(volts, (own and own.unit) or "V", of_bias))
+            self._check_range(name, value, replace(limit, unit=of_bias), reach)
+
+    def _limited_ends(self) -> tuple[Limit | None, list[str]]:
+        # the limit of the bias with a range, and the limited ends of sweeps
+        bias = self.limits.parameters.get(names.TIP_BIAS_VOLTAGE)
+        bias = bias if bias is not None and bias.has_range else None
+        given = self.limits.parameters
+        ends = [name for name in sorted(_ENDS) if name in given and given[name].has_range]
+        return bias, ends
+
+    def _ends_to_read(self) -> list[str]:
+        bias, ends = self._limited_ends()
+        needed = dict.fromkeys((*(names.SPEC_ENDS if bias else ()), *ends))
+        return [names.SPEC_KIND, *needed] if needed else []
+
+    def _check_curve(self) -> None:
+        bias, limited = self._limited_ends()
+        reported = self.state.last_seen.get(names.SPEC_KIND)
+        kind = (reported and reported.value) or "of no known kind"
+        sweeps_bias, sweeps_height = kind not in names.SWEEPS_HEIGHT, kind not in names.SWEEPS_BIAS
+        mine = {*(names.SPEC_ENDS if sweeps_bias else ()), *(names.SPEC_Z_ENDS if sweeps_height else ())}
+        ends = mine.intersection((*(names.SPEC_ENDS if bias else ()), *limited))
+        for name in sorted(ends):
+            own, known = self.limits.parameters.get(name), self.state.usage.known.get(name)
+            # what the ends of a vector program are, its table does not show
+            if known is None or (sweeps_bias and sweeps_height):
+                limit = own if own is not None and own.has_range else bias
+                if limit is not None and not limit.unseen_sweeps:
+                    raise _param_error(_unseen(kind, name, limit))
+                continue
+            if own is not None:
+                self._check_range(name, known.value, own, _TOLD_REACH)
+            if name in names.SPEC_ENDS:
+                self._check_bias(name, known.value, _TOLD_REACH)
 
     def _check_value(self, name: str, value: float, limit: Limit, now_ns: int) -> None:
         text = partial(_amount_text, name, limit)
@@ -505,6 +558,15 @@ class LimitChecker:
         if self.state.position.probe_m is None:
             raise _param_error("the microscope has not reported its probe position, so a part of it can't be checked")
         self._check_point(moved(self.state.position.probe_m, change))
+
+
+def _unseen(kind: str, end: str, limit: Limit) -> str:
+    what = "bias" if end in names.SPEC_ENDS else "height"
+    return (
+        f"a curve {kind} may sweep the {what}, and the microscope does not show how far ({end}), so that the limit "
+        f"can't be kept ({limit.source}); where the range set at the panel is known to be safe, allow it there: "
+        "unseen_sweeps = true"
+    )
 
 
 def _amount_text(name: str, limit: Limit, amount: float, digits: int = 6) -> str:

@@ -60,6 +60,7 @@ class Limit:
         rate_per_s: the largest change per experiment time since the parameter last changed, such as `"1 V/s"`.
         interval_s: the least experiment time between two requests.
         only: the components that may set the parameter or start the action.
+        unseen_sweeps: whether a curve may sweep the parameter though the microscope does not show how far.
         unit: of the values above (the rate: per second); None: SI for the base parameters.
         source: the place in the experiment file, e.g. "experiment.toml:42".
     """
@@ -70,6 +71,7 @@ class Limit:
     rate_per_s: Annotated[float | None, Bound(operator.le)] = None
     interval_s: Annotated[PositiveDuration | None, Bound(operator.ge)] = None
     only: Annotated[tuple[str, ...] | None, Bound(_is_part)] = None
+    unseen_sweeps: bool = False
     unit: str | None = None
     source: str = "[limits]"
 
@@ -81,9 +83,13 @@ class Limit:
         return self.step is not None or self.rate_per_s is not None
 
     @property
+    def has_range(self) -> bool:
+        return self.low is not None or self.high is not None
+
+    @property
     def is_of_a_number(self) -> bool:
         """Whether the parameter must be a number."""
-        return self.bounds_changes or self.low is not None or self.high is not None
+        return self.bounds_changes or self.has_range
 
 
 @dataclass(frozen=True)

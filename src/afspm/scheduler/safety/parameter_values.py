@@ -9,7 +9,7 @@ from typing import NamedTuple
 from afspm.basics.errors import AfspmError
 from afspm.basics.units import convert
 from afspm.model import Feedback, Parameter, PositionChange, ProbePosition, ScanParameters, names
-from afspm.model.parameter_names import BASE_PARAMETERS
+from afspm.model.parameter_names import BASE_PARAMETERS, OF_CURVES
 from afspm.model.positions import scan_values
 from afspm.scheduler.safety.limits import Limit
 
@@ -17,7 +17,8 @@ from afspm.scheduler.safety.limits import Limit
 class ParameterValue(NamedTuple):
     """A parameter with its number; None for a text or a switch.
 
-    The number is in the unit of the parameter's limit; without such a unit in SI for a base parameter, else as given.
+    The number is in the unit of the parameter's limit; without such a unit in SI for a base parameter or one of curves,
+    else as given.
     """
 
     name: str
@@ -84,7 +85,8 @@ def _number(parameter: Parameter, text: str, limit: Limit | None) -> float | Non
             return None
         raise ParameterValueError(f"{name} = {text!r} is not a number") from None
     _finite(name, value)
-    unit = limit.unit if limit is not None and limit.unit is not None else BASE_PARAMETERS.get(name)
+    si = BASE_PARAMETERS.get(name) or OF_CURVES.get(name)
+    unit = limit.unit if limit is not None and limit.unit is not None else si
     # without a unit an angle is in degrees on the wire, everything else in SI
     given = parameter.unit or ("deg" if unit == "rad" else unit)
     if not given or unit is None or given == unit:

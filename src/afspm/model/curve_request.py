@@ -1,0 +1,89 @@
+"""What a request for a curve may say of it: from where to where, with how many points, how slowly, and the lock-in."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from typing import Final
+
+from afspm.basics.errors import InvalidValue, UnitError
+from afspm.basics.units import parse_quantity, si
+from afspm.model import parameter_names as names
+from afspm.model.requests import Parameter
+
+_SWEPT: Final = {"V": names.SPEC_ENDS, "m": names.SPEC_Z_ENDS}
+"""The parameters of both ends, by the unit of the swept quantity."""
+_QUANTITIES: Final = {
+    "point_time": (names.SPEC_POINT_TIME, "s"),
+    "z_offset": (names.SPEC_Z_OFFSET, "m"),
+}
+_LOCK_IN: Final = {"amplitude": (names.LOCK_IN_AMPLITUDE, "V"), "frequency": (names.LOCK_IN_FREQUENCY, "Hz")}
+KEYS: Final = ("sweep", "points", *_QUANTITIES, "lock_in")
+"""What a request may say."""
+CurveSettings = Mapping[str, object]
+CurveTable = dict[str, int | float | str | list[str] | dict[str, float | str]]
+"""The settings as a table of an experiment file."""
+
+
+def curve_parameters(given: CurveSettings, where: str = "curve") -> tuple[Parameter, ...]:
+    """Return the parameters that a request for curves sets.
+
+    Args:
+        given: any of `sweep`, first and last value as texts with a unit: of the bias ("-500 mV", "500 mV"), or of the
+            height ("20 nm", "-1 nm"), which is 0 where the feedback was opened and positive away from the sample;
+            `points`; `point_time`, time to measure each point; `z_offset`, height at which a bias is swept, as for a
+            sweep of the height; `lock_in`, a mapping with `amplitude` (peak, of the bias) and `frequency`. Other
+            quantities than `sweep` may be numbers in SI.
+        where: place of the request, for errors.
+
+    Raises:
+        InvalidValue, UnitError: a key or a value is not valid.
+    """
+    _known(given, KEYS, where)
+    made = []
+    if (sweep := given.get("sweep")) is not None:
+        made += _ends(sweep, f"{where}.sweep")
+    if (points := given.get("points")) is not None:
+        if isinstance(points, bool) or not isinstance(points, int) or points < 2:
+            raise InvalidValue(f"a curve can't have {points!r} points", where=f"{where}.points", hint="2 or more")
+        made.append(Parameter(names.SPEC_POINTS, str(points)))
+    for key, (name, unit) in _QUANTITIES.items():
+        made += _quantity(given.get(key), name, unit, f"{where}.{key}")
+    lock_in = given.get("lock_in") or {}
+    if not isinstance(lock_in, Mapping):
+        raise InvalidValue(f"expected amplitude and frequency, got {lock_in!r}", where=f"{where}.lock_in")
+    _known(lock_in, _LOCK_IN, f"{where}.lock_in")
+    for key, (name, unit) in _LOCK_IN.items():
+        made += _quantity(lock_in.get(key), name, unit, f"{where}.lock_in.{key}")
+    return tuple(made)
+
+
+def _known(given: Mapping[str, object], known: Collection[str], where: str) -> None:
+    for key in given:
+        if key not in known:
+            raise InvalidValue(f"there is no {key!r}", where=where, hint=f"one of {', '.join(known)}")
+
+
+def _ends(sweep: object, where: str) -> list[Parameter]:
+    hint = 'first and last value with their unit, such as ("-500 mV", "500 mV") or ("20 nm", "-1 nm")'
+    if isinstance(sweep, str) or not isinstance(sweep, Sequence) or len(sweep) != 2:
+        raise InvalidValue(f"{sweep!r} is no sweep", where=where, hint=hint)
+    for unit, ends in _SWEPT.items():
+        try:
+            values = [si(end, unit) for end in sweep if isinstance(end, str) and parse_quantity(end)[1]]
+        except UnitError:
+            continue
+        if len(values) == 2 and all(map(math.isfinite, values)) and values[0] != values[1]:
+            return [Parameter(name, repr(value), unit) for name, value in zip(ends, values, strict=True)]
+    raise InvalidValue(f"{sweep!r} is no sweep of a bias or a height", where=where, hint=hint)
+
+
+def _quantity(value: object, name: str, unit: str, where: str) -> list[Parameter]:
+    if value is None:
+        return []
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        raise InvalidValue(f"{value!r} is no quantity in {unit}", where=where)
+    number = si(value, unit)
+    if not math.isfinite(number):
+        raise InvalidValue(f"{value!r} is not finite", where=where)
+    return [Parameter(name, repr(number), unit)]
