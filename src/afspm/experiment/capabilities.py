@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from afspm.basics.errors import AfspmError, Refused
+from afspm.basics.errors import AfspmError, InvalidValue, Refused
 from afspm.experiment.toml_lines import Table
 from afspm.model import ChannelRoles, Parameter, Region, names
 
 if TYPE_CHECKING:
-    from afspm.translator.parameters import ParameterTable
+    from afspm.translator.driver import Driver
+    from afspm.translator.parameters import ParameterTable, Value
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class MicroscopeCapabilities:
         max_pixels: the largest number of pixels of a scan.
         channels: the channels that the microscope may have, by their roles.
         never_withdrawn: actions that need a withdrawn tip, if the microscope never shows the tip.
+        refused_commands: the reasons and remedies why the microscope refuses commands, by the action's name.
     """
 
     actions: frozenset[str]
@@ -34,6 +36,7 @@ class MicroscopeCapabilities:
     channels: ChannelRoles
     max_pixels: int
     never_withdrawn: tuple[str, ...] = ()
+    refused_commands: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
     def refuses(self, parameter: Parameter) -> str:
         """Return the reason of the microscope to refuse a value; empty for a valid value or an unknown parameter."""
@@ -73,18 +76,37 @@ def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None
     try:
         channels = microscope.channels_of(settings)
         table = microscope.parameter_table(microscope.rows(settings))
-        sets = {name: _set_by(what, table) for name, what in added.items()}
+        commanded, refused = _commanded_by(microscope, added, table)
+        sets = {name: (*_set_by(what, table), *commanded.get(name, ())) for name, what in added.items()}
         never = microscope.never_withdrawn(settings)
     except (AfspmError, AttributeError):
         return None  # the check of its settings reports the error in the table
     units = {name: table[name].si_unit for name in table}
-    return MicroscopeCapabilities(frozenset(actions), units, sets, table, channels, acting.max_pixels, never)
+    most = acting.max_pixels
+    return MicroscopeCapabilities(frozenset(actions), units, sets, table, channels, most, never, refused)
 
 
 def _set_by(action: object, table: ParameterTable) -> tuple[Parameter, ...]:
     given = action.get("set") if isinstance(action, Mapping) else None
     values = table.written(given, where="actions") if isinstance(given, Mapping) else {}
-    return tuple(Parameter(name, str(value), table[name].si_unit or None) for name, value in values.items())
+    return _parameters(values.items(), table)
+
+
+def _commanded_by(
+    microscope: type[Driver], added: Table, table: ParameterTable
+) -> tuple[dict[str, tuple[Parameter, ...]], dict[str, tuple[str, str]]]:
+    commanded, refused = {}, {}
+    for name, action in added.items():
+        try:
+            values = microscope.values_commanded(action, table) if isinstance(action, Mapping) else ()
+            commanded[name] = _parameters(values, table)
+        except (InvalidValue, Refused) as error:
+            refused[name] = (error.what, error.hint)
+    return commanded, refused
+
+
+def _parameters(values: Iterable[tuple[str, Value]], table: ParameterTable) -> tuple[Parameter, ...]:
+    return tuple(Parameter(name, str(value), table[name].si_unit or None) for name, value in values)
 
 
 def base() -> dict[str, str | None]:

@@ -154,6 +154,9 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
             what = f"[{translator.name}] actions: the limits would always refuse {reason}"
             resolved.document.error(what, translator.name, "actions", action)
         there = translator.capabilities()
+        for action, (reason, hint) in () if there is None else there.refused_commands.items():
+            what = f"[{translator.name}] actions.{action}: {reason}"
+            resolved.document.error(what, translator.name, "actions", action, hint=hint)
         for action in () if there is None else there.never_withdrawn:
             what = f"[{translator.name}] actions.{action}: it needs a withdrawn tip, which this microscope never shows"
             hint = "leave it out, and do it by hand after `afspm pause`"

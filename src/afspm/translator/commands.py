@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any
 
 from afspm.basics import units
-from afspm.basics.errors import AfspmError, ConfigError, Refused
+from afspm.basics.errors import AfspmError, ConfigError, InvalidValue, Refused
 from afspm.basics.plain_data import PlainMapping
 from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, names, request_name
 from afspm.model.microscope_status import STARTS
@@ -253,18 +253,30 @@ class Commands:
             moves = ScopeState.MOVING if MOVES & values.keys() else None
             state = moves if for_s is None else state_for(values)
             switches = bool(what.get("switches_feedback")) or (for_s is None and names.FEEDBACK_ON in values)
-            do = partial(self._run_added_action, values, command, for_s)
+            try:
+                commanded = dict(self._driver.values_commanded(what, self._driver.table))
+                do = partial(self._run_added_action, values, command, for_s, commanded)
+            except (InvalidValue, Refused) as error:
+                do = partial(_refuse, str(error))
             needs_withdrawn = self._driver.needs_withdrawn(what)
             added[name] = Action(name, do, state, switches_feedback=switches, needs_withdrawn=needs_withdrawn)
         return added
 
-    def _run_added_action(self, values: Mapping[str, Value], command: str | None, for_s: float | None) -> None:
+    def _run_added_action(
+        self, values: Mapping[str, Value], command: str | None, for_s: float | None, commanded: Mapping[str, Value]
+    ) -> None:
+        if commanded:
+            self._driver.refuse_unreachable(commanded, self._driver.in_force(commanded))
         if for_s is not None:
             self._temporary.begin(values, for_s)
         elif values:
             self._apply(values)
         if command is not None:
             self._driver.command(command)
+
+
+def _refuse(reason: str) -> None:
+    raise Refused(ControlResponse.ACTION_ERROR, reason)
 
 
 def _duration_s(given: Any, where: str) -> float:

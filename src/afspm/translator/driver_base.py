@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Protocol, TypeVar
 
 from afspm.basics.clock import Clock
-from afspm.basics.errors import AfspmError, ConfigError, InvalidValue, Refused
+from afspm.basics.errors import AfspmError, ConfigError, ErrorCollector, InvalidValue, Refused
 from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.basics.units import Duration, PollPeriod
 from afspm.model import ChannelRoles, ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
@@ -327,8 +327,44 @@ class DriverBase(ABC):
         Raises:
             ConfigError: a row has an impossible value.
         """
-        table = ParameterTable.from_toml(cls.parameters_file)
-        return table.extended(changed, where="the experiment file", translated=cls.translated)
+        where = "the experiment file"
+        table = ParameterTable.from_toml(cls.parameters_file).extended(changed, where=where, translated=cls.translated)
+        errors = ErrorCollector()
+        for name in [name for name in changed if name not in cls.translated]:
+            try:
+                cls.check_row(table[name])
+            except InvalidValue as error:
+                errors.add(ConfigError(error.what, where=f"{where}, parameters.{name}", hint=error.hint))
+        errors.raise_all()
+        return table
+
+    @classmethod  # noqa: B027 (most controllers take any name)
+    def check_row(cls, row: ParameterSpec) -> None:
+        """Raise InvalidValue for a row of the experiment file that the controller can't have.
+
+        Override where the vendor's names are known, or where a name would set a quantity beside its limits.
+        """
+
+    @classmethod
+    def commanded(cls, action: Mapping[str, object]) -> Sequence[tuple[str, Value]]:
+        """Return the parameters that the command of an action sets, with values in the vendor's units.
+
+        Override where it is known, so that limits judge such an action.
+
+        Raises:
+            InvalidValue: the controller has no such command, or an action may not use it.
+        """
+        return ()
+
+    @classmethod
+    def values_commanded(cls, action: Mapping[str, object], table: ParameterTable) -> list[tuple[str, Value]]:
+        """Return the parameters that the command of an action sets, with values in SI; a sweep sets two of one.
+
+        Raises:
+            InvalidValue: see `commanded`. Refused: a value is out of range.
+        """
+        given = cls.commanded(action) if "command" in action else ()
+        return [(name, table[name].checked(table[name].from_vendor(value))) for name, value in given]
 
     @classmethod
     def without_witness(cls, settings: PlainMapping) -> dict[str, str]:

@@ -23,7 +23,7 @@ from afspm.plugins.nanonis.emulator import RELEASES, NanonisEmulator, wire
 from afspm.plugins.nanonis.protocol import BadReply, NanonisError
 
 RELEASE_NUMBERS = tuple(RELEASES.values())
-NAMES = sorted(protocol.functions())
+NAMES = sorted(protocol.function_names())
 
 
 def references() -> list[Any]:
@@ -50,26 +50,46 @@ def test_the_emulated_controller_reads_the_reference_requests(name: str, expecte
         assert got == (pytest.approx(sent, rel=1e-6) if isinstance(sent, float) else sent)
 
 
-def test_both_sides_were_written_apart_and_agree_on_every_field() -> None:
-    for name, function in protocol.functions().items():
-        other = wire.functions()[name]
-        for ours, theirs in ((function.arguments, other.arguments), (function.layouts[0], other.results)):
-            assert list(ours) == [(field.code, field.since) for field in theirs], name
-            assert all(field.is_in(release) or field.since for field in theirs for release in RELEASE_NUMBERS), name
+def test_both_sides_read_the_same_fields_of_every_function_and_release() -> None:
+    assert protocol.function_names() == wire.functions().keys()
+    for name, other in wire.functions().items():
+        function = protocol.function(name)
+        for release in RELEASE_NUMBERS:
+            sent = [one.code for one in function.arguments if one.since <= release < one.until]
+            assert sent == other.argument_codes(release), name
+            assert list(function.result_codes(release)[0]) == other.result_codes(release), name
 
 
 EXAMPLES: dict[str, Any] = {
     "H": 7, "I": 4_000_000_000, "i": -3, "f": 0.25, "d": 1.5e-9, "S": "Größe", "A": ["Z (m)", "µ", ""],
     "[i]": [0, 14, -1], "[f]": [0.5, -2.0], "2f": np.arange(6.0).reshape(2, 3), "2S": [["a", "b"], ["c", ""]],
+    "[B]": [0, 255], "[I]": [4_000_000_000], "[d]": [1.5e-9, 0.0], "n": 2, "*i": [-1, 2], "*I": [1, 4_000_000_000],
+    "*f": [0.5, -2.0], "*S": ["Größe", ""],
 }  # fmt: skip
+
+
+def examples(fields: protocol.Fields) -> list[Any]:
+    return [EXAMPLES[field.code] for field in fields]
+
+
+@pytest.mark.parametrize("release", RELEASE_NUMBERS)
+def test_requests_of_every_release_are_read(release: int) -> None:
+    for name in NAMES:
+        fields = protocol.function(name).arguments
+        received = bytearray(protocol.request(name, examples(fields), release))
+        request = wire.split(received)
+        assert request is not None
+        expected = [EXAMPLES[one.code] for one in fields if one.since <= release < one.until]
+        for got, wanted in zip(wire.arguments(name, request[2], release), expected, strict=True):
+            assert np.array_equal(np.asarray(got), wanted) if isinstance(wanted, np.ndarray) else got == wanted, name
 
 
 @pytest.mark.parametrize("release", RELEASE_NUMBERS)
 def test_replies_of_every_release_are_read(release: int) -> None:
-    for name, function in protocol.functions().items():
-        sent = [EXAMPLES[code] for code, _ in function.layouts[0]]
+    for name in NAMES:
+        sent = examples(protocol.function(name).layouts[0])
         found = protocol.results(name, wire.body(name, sent, release), release)
-        expected = [EXAMPLES[code] for code in function.result_codes(release)[0]]
+        expected = [EXAMPLES[code] for code in protocol.function(name).result_codes(release)[0]]
         for got, wanted in zip(found, expected, strict=True):
             assert np.array_equal(np.asarray(got), wanted) if isinstance(wanted, np.ndarray) else got == wanted, name
 
@@ -90,7 +110,7 @@ def test_errors_are_read_with_results_and_without(text: str, bare: bool) -> None
     [("Scan.PropsGet", 14573, 14429), ("Scan.PropsGet", 13742, 14573), ("Piezo.DriftCompGet", 10862, 11798)],
 )
 def test_reply_of_another_release_is_reported(name: str, written: int, read: int) -> None:
-    sent = [EXAMPLES[code] for code, _ in protocol.functions()[name].layouts[0]]
+    sent = examples(protocol.function(name).layouts[0])
     with pytest.raises(BadReply, match=f"it was read as release {read}"):
         protocol.results(name, wire.body(name, sent, written), read)
 
@@ -152,7 +172,7 @@ def test_any_body_is_results_or_a_named_error(name: str, body: bytes, release: i
 def test_damaged_reply_is_results_or_a_named_error(name: str, data: st.DataObject) -> None:
     # Nearly right replies get further than random bytes.
     release = data.draw(st.sampled_from(RELEASE_NUMBERS))
-    sent = [EXAMPLES[code] for code, _ in protocol.functions()[name].layouts[0]]
+    sent = examples(protocol.function(name).layouts[0])
     body = bytearray(wire.body(name, sent, release))
     for _ in range(data.draw(st.integers(1, 4))):
         where = data.draw(st.integers(0, max(0, len(body) - 4)))
@@ -172,7 +192,7 @@ def _peak_bytes(name: str, body: bytes, release: int) -> int:
     try:
         with suppress(BadReply, NanonisError):
             found = protocol.results(name, body, release)
-            assert len(found) in map(len, protocol.functions()[name].result_codes(release))
+            assert len(found) in map(len, protocol.function(name).result_codes(release))
         return tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

@@ -458,9 +458,9 @@ def test_retracting_stops_a_scan(bench: Make) -> None:
 
 def test_retracting_ends_an_auto_approach_which_would_bring_the_tip_back(bench: Make) -> None:
     made = bench(speed=1.0)
-    peer = made.start(actions={"x-approach": {"command": "AutoApproach.OnOffSet 1"}})
+    peer = made.start()
     peer.until(FREE)
-    assert peer.act("x-approach").ok
+    made.at_panel(lambda emulator: emulator.software.functions.call("AutoApproach.OnOffSet", [1]))
     peer.until(ScopeState.COARSE_MOTOR)
     assert peer.act(names.RETRACT).ok
     peer.until(FREE)
@@ -533,21 +533,6 @@ def test_drift_rate_in_z_comes_into_force_only_if_it_was(bench: Make) -> None:
         made.at_panel(partial(_left_by_earlier_work, was_on))
         assert peer.set("x-drift-rate-x", "2", "pm/s").ok
         assert registers.get("Piezo.DriftComp")[3] == pytest.approx(5e-11 * was_on)
-
-
-def test_parameters_and_actions_of_the_experiment_file(bench: Make) -> None:
-    made = bench()
-    peer = made.start(
-        parameters={"x-tip-lift": {"vendor": "ZCtrl.TipLift", "unit": "m"}},
-        actions={"x-home": {"command": "ZCtrl.Home"}, "x-wrong": {"command": "Bias.Set 1 2"}},
-    )
-    peer.until(FREE)
-    assert peer.set("x-tip-lift", "2", "nm").ok
-    assert made.emulator.software.core.registers.get("ZCtrl.TipLift") == (pytest.approx(2e-9),)
-    assert peer.act("x-home").ok
-    response = peer.act("x-wrong")
-    assert response.code == ControlResponse.ACTION_ERROR
-    assert "the arguments of Bias.Set are f" in response.reason
 
 
 def test_measured_value_is_compared_within_the_resolution_of_its_row(bench: Make) -> None:

@@ -138,6 +138,6 @@ def test_impossible_settings_of_the_simulator_are_refused(settings: dict[str, ob
 @pytest.mark.parametrize("driver", entry_points.names(entry_points.DRIVERS))
 def test_every_driver_compares_within_the_resolution_of_a_row(driver: str) -> None:
     made = object.__new__(entry_points.load(entry_points.DRIVERS, driver))
-    made.table = type(made).parameter_table({"x-own": {"unit": "m", "resolution": "20 pm"}})
+    made.table = type(made).parameter_table({"x-own": {"vendor": "ZCtrl.TipLift", "unit": "m", "resolution": "20 pm"}})
     assert made.same("x-own", 7.12e-11, 6.94e-11, {})  # spectra F4
     assert not made.same("x-own", 7.12e-11, 1.12e-10, {})

@@ -17,10 +17,9 @@ sends nothing unrequested.
 from __future__ import annotations
 
 import codecs
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, cast
 
 from afspm.basics import ConfigError, Current, Duration, FileError, Refused, Voltage
 from afspm.driver import (
@@ -42,6 +41,7 @@ from afspm.driver import (
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, both_ways, names
 from afspm.plugins.nanonis import fetched, geometry, parameter_groups, protocol, z_controller
 from afspm.plugins.nanonis.activity import SAFE_TIP, WITHDRAWING, NanonisActivity
+from afspm.plugins.nanonis.experiment_functions import FunctionCall, ValueFunctions, check_row, values_commanded
 from afspm.plugins.nanonis.preamplifier import Preamplifier
 from afspm.plugins.nanonis.result_files import NanonisFiles
 from afspm.plugins.nanonis.session import MODULES, Link, Ports, Session, WithdrawalPort
@@ -329,15 +329,22 @@ class Nanonis(Driver):
             self._preamplifier.refuse_beyond(float(setpoint))
 
     def get(self, vendor: str) -> Value:
-        """Return a value by the prefix of a pair of functions: "Bias." means Bias.Get."""
+        """Return a value by the name of its functions, see `ValueFunctions`: "Bias." means Bias.Get."""
         if vendor == names.CONTROLLER:
             return self._there.controller
-        value: Value = parameter_groups.numbers(self._ask, f"{vendor}Get")[0]
-        return value
+        of = ValueFunctions.of(vendor)
+
+        def ask(name: str, *keys: object) -> tuple[Any, ...]:
+            return self._ask(name, *keys)[of.place : of.place + 1]  # another value may be infinite
+
+        (value,) = parameter_groups.numbers(ask, of.getter, *of.keys)
+        return cast(Value, value)
 
     def set(self, values: Mapping[str, Value]) -> None:
         for vendor, value in values.items():
-            self._ask(f"{vendor}Set", value)
+            of = ValueFunctions.of(vendor)
+            present = self._ask(of.getter, *of.keys) if of.is_one_of_several else (value,)
+            self._ask(of.setter, *of.arguments(value, present))
 
     # --- results ---
 
@@ -483,14 +490,16 @@ class Nanonis(Driver):
 
     def command(self, text: str) -> None:
         """Call a function with its arguments, e.g. "AutoApproach.OnOffSet 1"."""
-        name, *words = shlex.split(text)
-        codes = [code for code, _ in protocol.function(name).arguments]
-        try:
-            arguments = [_argument(code, word) for code, word in zip(codes, words, strict=True)]
-        except ValueError as error:
-            reason = f"{text!r}: the arguments of {name} are {' '.join(codes) or 'none'}"
-            raise Refused(ControlResponse.ACTION_ERROR, reason) from error
-        self._ask(name, *arguments)
+        call = FunctionCall.of(text)
+        self._ask(call.name, *call.arguments)
+
+    @classmethod
+    def commanded(cls, action: Mapping[str, object]) -> Sequence[tuple[str, Value]]:
+        return values_commanded(action)
+
+    @classmethod
+    def check_row(cls, row: ParameterSpec) -> None:
+        check_row(row)
 
     def _prepare_panel(self) -> None:
         # Set only if the panel differs: one scan, not continuous, saved. PropsGet and PropsSet count differently (in
@@ -508,16 +517,6 @@ class Nanonis(Driver):
                 raise Refused(ControlResponse.ACTION_ERROR, _CONTINUOUS)
             if save and autosave != 0:
                 self.log.warning(_UNSAVED)
-
-
-def _argument(code: str, word: str) -> object:
-    if code in "HIi":
-        return int(word)
-    if code in "fd":
-        return float(word)
-    if code == "S":
-        return word
-    raise ValueError(code)
 
 
 def _code_page(name: str) -> str:

@@ -6,6 +6,7 @@ A message has a header of 40 bytes (name, size of the body) and a body; every re
 
 from __future__ import annotations
 
+import difflib
 import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
@@ -13,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 
@@ -28,7 +29,21 @@ LARGEST_BODY: Final = 1 << 29
 
 # Big-endian: name padded with zeros, size of the body, 1 to request a reply, zero.
 _HEADER: Final = struct.Struct(">32sihh")
-_NUMBERS: Final = {code: struct.Struct(">" + code) for code in "HIifd"}
+_NUMBERS: Final = {code: struct.Struct(">" + code) for code in "BHIifd"}
+_FIELD: Final = re.compile(r"([^@?=-]+)(\?|-|=-?\d+)?(?:@(\d+))?(?:@<(\d+))?")
+_TYPES: Final = {
+    "B": "uint8",
+    "H": "uint16",
+    "I": "uint32",
+    "i": "int32",
+    "f": "float32",
+    "d": "float64",
+    "S": "text",
+    "A": "[text,...]",
+    "n": "int32 (length of the lists)",
+    "2f": "table of float32",
+    "2S": "table of text",
+}
 
 
 class BadReply(ControllerLost):
@@ -47,49 +62,82 @@ class NanonisError(AfspmError):
     code = "nanonis"
 
 
+class FieldType(NamedTuple):
+    """The type of one field of a request or a reply.
+
+    Attributes:
+        code, mark: type code, and relation between `…Set` and `…Get`, see `functions.txt`.
+        since, until: first release with the field, first later release without it.
+    """
+
+    code: str
+    mark: str = ""
+    since: int = 0
+    until: int = NEWEST + 1
+
+    @property
+    def text(self) -> str:
+        """The type as text for people."""
+        return f"[{_TYPES[self.code[1]]},...]" if self.code[0] in "[*" else _TYPES[self.code]
+
+
+Fields = tuple[FieldType, ...]
+
+
 @dataclass(frozen=True)
 class Function:
     """One function of the protocol.
 
     Attributes:
-        arguments: fields in order, each as (type code, first release that has the field).
+        arguments: fields in order.
         layouts: the possible results, each as fields in order; more than one where sources differ.
     """
 
     name: str
-    arguments: tuple[tuple[str, int], ...]
-    layouts: tuple[tuple[tuple[str, int], ...], ...]
-
-    def argument_codes(self, release: int) -> tuple[str, ...]:
-        """Return the type codes of the fields in a request to a release."""
-        return tuple(code for code, since in self.arguments if since <= release)
+    arguments: Fields
+    layouts: tuple[Fields, ...]
 
     def result_codes(self, release: int) -> list[tuple[str, ...]]:
         """Return the type codes of the fields in a reply of a release, for each layout."""
-        return [tuple(code for code, since in fields if since <= release) for fields in self.layouts]
+        return [tuple(one.code for one in fields if one.since <= release < one.until) for fields in self.layouts]
 
 
-def _fields(text: str) -> tuple[tuple[str, int], ...]:
-    parts = (field.partition("@") for field in text.split() if field != "-")
-    return tuple((code, int(since or 0)) for code, _, since in parts)
+def _fields(text: str) -> Fields:
+    matches = (_FIELD.fullmatch(field) for field in text.split() if field != "-")
+    return tuple(
+        FieldType(found[1], found[2] or "", int(found[3] or 0), int(found[4] or NEWEST + 1))
+        for found in matches
+        if found is not None
+    )
 
 
 @cache
-def functions() -> Mapping[str, Function]:
-    """Return the known functions by name."""
-    rows = {}
-    for line in Path(__file__).with_name("functions.txt").read_text(encoding="ascii").splitlines():
-        if line and not line.startswith("#"):
-            name, arguments, results = re.split(" {2,}", line)
-            rows[name] = Function(name, _fields(arguments), tuple(map(_fields, results.split(" | "))))
-    return rows
+def _rows() -> Mapping[str, str]:
+    # a line is parsed when its function is used: all of them would delay the start of a translator by 15 ms
+    lines = Path(__file__).with_name("functions.txt").read_text(encoding="ascii").splitlines()
+    return {line.partition(" ")[0]: line for line in lines if line and line[0] != "#"}
 
 
+def function_names() -> frozenset[str]:
+    """Return the names of the known functions."""
+    return frozenset(_rows())
+
+
+@cache
 def function(name: str) -> Function:
     """Return a function by name. Raises InvalidValue: `functions.txt` has no such function."""
-    if name not in functions():
-        raise InvalidValue(f"Nanonis has no function {name[:50]!r}")
-    return functions()[name]
+    if name not in _rows():
+        near = " or ".join(difflib.get_close_matches(name[:50], _rows(), n=3))
+        raise InvalidValue(
+            f"afspm's table of Nanonis functions has no {name[:50]!r}", hint=f"perhaps {near}" if near else ""
+        )
+    _, arguments, results, *_ = re.split(" {2,}", _rows()[name])
+    return Function(name, _fields(arguments), tuple(map(_fields, results.split(" | "))))
+
+
+def types_text(fields: Fields) -> str:
+    """Return the types of fields as text for people, "int32 uint32"."""
+    return " ".join(field.text for field in fields) or "none"
 
 
 def request(name: str, arguments: Sequence[object], release: int = NEWEST) -> bytes:
@@ -100,14 +148,15 @@ def request(name: str, arguments: Sequence[object], release: int = NEWEST) -> by
     """
     fields = function(name).arguments
     if len(arguments) != len(fields):
-        raise InvalidValue(f"{name} takes {len(fields)} arguments, got {len(arguments)}")
-    body = b""
-    for (code, since), value in zip(fields, arguments, strict=True):
-        if since <= release:
+        raise InvalidValue(f"{name} takes {len(fields)} arguments ({types_text(fields)}), got {len(arguments)}")
+    body, shared = b"", 0
+    for field, value in zip(fields, arguments, strict=True):
+        if field.since <= release < field.until:
             try:
-                body += _WRITERS[code](value)
+                body += _encoded(field.code, value, shared)
             except (struct.error, OverflowError, TypeError, ValueError) as error:
-                raise InvalidValue(f"{name}: {value!r} can't be sent as {code}: {error}") from error
+                raise InvalidValue(f"{name}: {value!r} can't be sent as {field.text}: {error}") from error
+            shared = cast(int, value) if field.code == "n" else shared
     # A reply is always requested: without one, a refusal would go unnoticed.
     return _HEADER.pack(name.encode("ascii"), len(body), 1, 0) + body
 
@@ -178,12 +227,12 @@ def results(name: str, body: bytes | bytearray, release: int = NEWEST, code_page
 
 
 def _depends_on_release(name: str) -> bool:
-    return any(since for fields in function(name).layouts for _, since in fields)
+    return any(one.since or one.until <= NEWEST for fields in function(name).layouts for one in fields)
 
 
 def _parsed(body: bytes | bytearray, codes: Sequence[str], code_page: str) -> tuple[tuple[object, ...], int, str]:
     reader = _Reader(memoryview(body), code_page)
-    found = tuple(_READERS[code](reader) for code in codes)
+    found = tuple(reader.field(code) for code in codes)
     # The error block at the end of every reply: a status, and a text.
     status, text = reader.number("I"), reader.text()
     if reader.left:
@@ -198,6 +247,20 @@ class _Reader:
         self._body = body
         self._code_page = code_page
         self._at = 0
+        self._shared = 0
+
+    def field(self, code: str) -> object:
+        """Return the value of a field by its type code."""
+        if code in _NUMBERS:
+            return self.number(code)
+        if code in _READERS:
+            return _READERS[code](self)
+        if code == "n":
+            self._shared = self.count(1)
+            return self._shared
+        item = code[1]
+        count = self._shared if code[0] == "*" else self.count(_NUMBERS[item].size)
+        return [self.text() for _ in range(count)] if item == "S" else self.numbers(item, count)
 
     @property
     def left(self) -> int:
@@ -229,9 +292,8 @@ class _Reader:
             raise BadReply(f"{count} elements in {self.left} bytes")
         return count
 
-    def numbers(self, code: str) -> list[object]:
-        raw = self.take(4 * self.count(4))
-        found = struct.unpack(f">{len(raw) // 4}{code}", raw)
+    def numbers(self, code: str, count: int) -> list[object]:
+        found = struct.unpack(f">{count}{code}", self.take(count * _NUMBERS[code].size))
         return [shortest_single(one) if code == "f" else one for one in found]
 
     def shape(self) -> tuple[int, int]:
@@ -251,23 +313,28 @@ class _Reader:
         return [[self.text() for _ in range(columns)] for _ in range(rows)]
 
 
-def _reader_of(code: str) -> Callable[[_Reader], object]:
-    return lambda reader: reader.number(code)
-
-
 _READERS: Final[Mapping[str, Callable[[_Reader], object]]] = {
-    **{code: _reader_of(code) for code in _NUMBERS},
     "S": _Reader.text,
     "A": _Reader.texts,
-    "[i]": lambda reader: reader.numbers("i"),
-    "[f]": lambda reader: reader.numbers("f"),
     "2f": _Reader.array,
     "2S": _Reader.text_array,
 }
 
 
-def _counted(code: str, values: Sequence[object]) -> bytes:
-    return struct.pack(f">i{len(values)}{code}", len(values), *values)
+def _encoded(code: str, value: Any, shared: int) -> bytes:
+    # `shared` is the length of lists that follow one length field
+    if code in _NUMBERS or code == "n":
+        return _NUMBERS[code.replace("n", "i")].pack(value)
+    if code == "S":
+        return _text(value)
+    if code == "A":
+        return _texts(value)
+    if code == "2f":
+        return struct.pack(">ii", *np.shape(value)) + np.asarray(value, ">f4").tobytes()
+    if code[0] == "*" and len(value) != shared:
+        raise ValueError(f"it has {len(value)} items, not {shared}")
+    items = b"".join(map(_text, value)) if code[1] == "S" else struct.pack(f">{len(value)}{code[1]}", *value)
+    return items if code[0] == "*" else struct.pack(">i", len(value)) + items
 
 
 def _text(value: str) -> bytes:
@@ -278,12 +345,3 @@ def _text(value: str) -> bytes:
 def _texts(values: Sequence[str]) -> bytes:
     raw = b"".join(map(_text, values))
     return struct.pack(">ii", len(raw), len(values)) + raw
-
-
-_WRITERS: Final[Mapping[str, Callable[[Any], bytes]]] = {
-    **{code: number.pack for code, number in _NUMBERS.items()},
-    "S": _text,
-    "A": _texts,
-    "[i]": lambda values: _counted("i", values),
-    "[f]": lambda values: _counted("f", values),
-}

@@ -110,12 +110,22 @@ def refusal(limits: ExperimentLimits, request: Request, present: PresentState, *
     Args:
         certain: whether only a state that is certainly forbidden counts, as for a plan before its run.
     """
-    changed = None
-    for rule in judging(limits, request):
-        changed = changed_by(limits, request) if changed is None else changed
-        if why := _Decision.of(rule, request, changed, present).refusal(certain=certain):
-            return why
+    rules = judging(limits, request)
+    for changed in _changes(limits, request) if rules else ():
+        for rule in rules:
+            if why := _Decision.of(rule, request, changed, present).refusal(certain=certain):
+                return why
     return ""
+
+
+def _changes(limits: ExperimentLimits, request: Request) -> Iterator[dict[str, Parameter]]:
+    # an action whose command sets the ends of a sweep sets one parameter twice: each of its values must be allowed
+    changed = changed_by(limits, request)
+    yield changed
+    if request.kind == ControlRequest.ACTION:
+        for subject in limits.sets.get(str(request.subject), ()):
+            if changed[subject.name] != subject:
+                yield {**changed, subject.name: subject}
 
 
 class PlanRehearsal:

@@ -96,9 +96,10 @@ class NanonisFunction:
 def functions() -> Mapping[str, NanonisFunction]:
     """Return the protocol's functions by name."""
     found = {}
-    for line in Path(__file__).with_name("functions.txt").read_text(encoding="ascii").splitlines():
+    for line in Path(__file__).parents[1].joinpath("functions.txt").read_text(encoding="ascii").splitlines():
         if line and not line.startswith("#"):
             name, arguments, results, *since = re.split(" {2,}", line)
+            results = results.partition(" | ")[0]
             found[name] = NanonisFunction(_fields(arguments), _fields(results), int(since[0]) if since else 0)
     return found
 
