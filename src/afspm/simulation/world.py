@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,7 +21,18 @@ from afspm.model.snapshot import restored, snapshot
 from afspm.simulation import chance, spectra
 from afspm.simulation.drift import DriftSettings, ScannerCompensation
 from afspm.simulation.feedback import FeedbackSettings, Loop
-from afspm.simulation.measuring import Adjustment, Felt, Setup, SignalSettings, TipTimes, at_rest, feel, measure
+from afspm.simulation.measuring import (
+    Adjustment,
+    Felt,
+    Held,
+    Setup,
+    SignalSettings,
+    TipTimes,
+    at_rest,
+    feel,
+    measure,
+    rest_z_m,
+)
 from afspm.simulation.noise import NoiseSettings
 from afspm.simulation.property_map import PropertyMap, PropertyMapSettings
 from afspm.simulation.sample import Sample, SurfaceMark
@@ -137,9 +148,10 @@ def _named_scanner(tables: dict[str, object], errors: ErrorCollector) -> Mapping
     return SCANNERS.get(str(name), {})
 
 
-STATE_VERSION = 3
+STATE_VERSION = 4
 _POINT_M = 1e-12
 _SAME_PLACE_M = 20e-12
+_FIRST_BIAS_V = 0.1
 
 
 @dataclass(frozen=True)
@@ -154,7 +166,7 @@ class WorldState:
     came_from_m: tuple[float, float]
     came_s: float
     moves: list[tuple[float, float, float]]
-    held_z_m: float | None
+    held: Held
     tips: list[TipChange]
     marks: list[SurfaceMark]
     compensation: list[tuple[float, float, float, float, float]]
@@ -174,7 +186,7 @@ class World:
         self._calls = 0
         self._place = ScannerPlace(self.settings.scanner, start_s)
         self._scales = self.settings.scanner.scales(seed)
-        self._held_z_m: float | None = None
+        self._held = Held(None, self.settings.feedback.first_setpoint, _FIRST_BIAS_V)
         self._felt_at_rest: tuple[object, Felt] | None = None
 
     @classmethod
@@ -227,11 +239,17 @@ class World:
         setup = self._setup(loop, bias_v, slope, start_s)
         measured = measure(course, tips, setup, chance.generator(self.seed, 2, call))
         # the whole scan is computed with each adjustment and the same noise; then its lines are taken over
+        self._hold_conditions(loop, bias_v)
         for one in adjusted:
-            setup = self._setup(Loop.of(self.settings.feedback, one.feedback), one.bias_v, slope, start_s)
+            rows = course.row_times_s(0.0) >= one.t_s
+            if lines := len(rows) - int(np.count_nonzero(rows)):
+                self._held = replace(self._held, z_m=float(measured.ends_z_m[lines - 1]))
+            loop = Loop.of(self.settings.feedback, one.feedback)
+            setup = self._setup(loop, one.bias_v, slope, start_s)
             anew = measure(course, tips, setup, chance.generator(self.seed, 2, call))
-            measured = measured.continued(anew, course.row_times_s(0.0) >= one.t_s)
-        self._held_z_m = measured.last_z_m
+            measured = measured.continued(anew, rows, lines)
+            self._hold_conditions(loop, one.bias_v)
+        self._held = replace(self._held, z_m=float(measured.ends_z_m[-1]))
         self._tip.wear(course, loop)
         drift = self.sample.drift.at(course.row_times_s(0.25))
         truth = {
@@ -255,8 +273,9 @@ class World:
     ) -> dict[str, float]:
         """Return the value of each channel while the tip stands still, without changing the world.
 
-        With the feedback off, z is the value set by `hold`, or z at the end of the last scan; before the first scan and
-        after a crash, z is the height of the surface.
+        With the feedback off, z is the value set by `hold`, or z when it was switched off (`remember`), or at the end
+        of the last scan; before all of these and after a crash, z is the height of the surface. Setpoint and bias that
+        the feedback held then define the distance of the tip from the sample.
 
         Args:
             random: generator for the noise, so that other measurements stay the same.
@@ -267,8 +286,12 @@ class World:
         if not all(map(math.isfinite, (bias_v, *slope, *position_m))):
             raise InvalidValue(f"bias {bias_v} V, slope {slope} and position {position_m} must be finite")
         loop = Loop.of(self.settings.feedback, feedback)
-        course = Course(Region(position_m, (_POINT_M, _POINT_M)), (1, 1), 1e-3, t_s)
         setup = self._setup(loop, bias_v, slope, t_s)
+        course, tip, felt = self._felt(position_m, t_s, setup)
+        return at_rest(course, felt, tip, setup, random)
+
+    def _felt(self, position_m: tuple[float, float], t_s: float, setup: Setup) -> tuple[Course, TipShape, Felt]:
+        course = Course(Region(position_m, (_POINT_M, _POINT_M)), (1, 1), 1e-3, t_s)
         tip = self._tip.at(t_s)
         settling_m = float(self._place.settling_m(np.array([t_s]))[0])
         where_m = (*self.under(position_m, t_s), self.sample.seen_drift_m(t_s)[2] + settling_m)
@@ -276,7 +299,30 @@ class World:
         key = (where, tip, len(self.sample.marks))
         if self._felt_at_rest is None or self._felt_at_rest[0] != key:
             self._felt_at_rest = key, feel(course, [(t_s, tip)], setup)
-        return at_rest(course, self._felt_at_rest[1], tip, setup, random)
+        return course, tip, self._felt_at_rest[1]
+
+    def remember(
+        self,
+        position_m: tuple[float, float],
+        t_s: float,
+        feedback: Feedback,
+        bias_v: float,
+        *,
+        slope: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        """Remember z, setpoint and bias of a feedback that is switched off at a position now.
+
+        Raises:
+            InvalidValue: invalid feedback.
+        """
+        loop = Loop.of(self.settings.feedback, replace(feedback, on=True))
+        setup = self._setup(loop, bias_v, slope, t_s)
+        course, _, felt = self._felt(position_m, t_s, setup)
+        self._held = Held(rest_z_m(course, felt, setup), loop.setpoint, bias_v)
+
+    def _hold_conditions(self, loop: Loop, bias_v: float) -> None:
+        if loop.on:
+            self._held = replace(self._held, setpoint=loop.setpoint, bias_v=bias_v)
 
     def hold(self, z_m: float) -> None:
         """Set z while the feedback is off.
@@ -286,7 +332,7 @@ class World:
         """
         if not math.isfinite(z_m):
             raise InvalidValue(f"z can't be held at {z_m} m")
-        self._held_z_m = z_m / self._scales[2]
+        self._held = replace(self._held, z_m=z_m / self._scales[2])
 
     def move_to(self, position_m: tuple[float, float], t_s: float) -> None:
         """Move the scanner to a position that it reaches at `t_s`; its creep begins then."""
@@ -413,7 +459,7 @@ class World:
         radius = 3.0 * math.sqrt(2.0 * tip.imaging_radius_m * into_m) * random.uniform(0.8, 1.4)
         outcome = self._tip.crash(depth_m, speed_m_s, t_s, random)
         self.sample.mark("crash", self._true_m(position_m, t_s), t_s, into_m * random.uniform(0.6, 0.9), radius)
-        self._held_z_m = None
+        self._held = replace(self._held, z_m=None)
         return outcome
 
     def drift_m(self, t_s: ArrayLike) -> Array:
@@ -460,7 +506,7 @@ class World:
             came_from_m=self._place.came_from_m,
             came_s=self._place.came_s,
             moves=self._place.moves,
-            held_z_m=self._held_z_m,
+            held=self._held,
             tips=self._tip.history,
             marks=self.sample.marks,
             compensation=self.sample.compensation.turns,
@@ -478,7 +524,7 @@ class World:
             theirs, mine = getattr(found, name), getattr(self, name)
             if theirs != mine:
                 raise InvalidValue(f"a saved state with {name} {theirs!r} instead of {mine!r}")
-        self._calls, self._held_z_m = found.calls, found.held_z_m
+        self._calls, self._held = found.calls, found.held
         self._place.at_m, self._place.came_from_m, self._place.came_s = found.at_m, found.came_from_m, found.came_s
         self._place.moves = found.moves
         self._tip.history, self._tip.scheduled_until_s = found.tips, found.scheduled_until_s
@@ -509,10 +555,17 @@ class World:
             signals=self.settings.signals,
             loop=loop,
             bias_v=bias_v,
-            held_z_m=self._held_z_m,
+            held=self._held,
+            contact_v=self._contact_v,
             slope=slope,
             sharp_m=self.settings.tip.radius_m,
         )
+
+    def _contact_v(self, material: Array, x_m: Array, y_m: Array) -> Array:
+        if self.property_map.quantity == "contact_potential" and self.property_map.is_on:
+            return self.property_map.at(x_m, y_m)
+        low, high = self.settings.signals.contact_potential_v
+        return low + (high - low) * material
 
 
 def _truth_of_scan(sample: Sample, course: Course, tips: TipTimes) -> dict[str, object]:
