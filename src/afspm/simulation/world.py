@@ -29,6 +29,8 @@ from afspm.simulation.measuring import (
     SignalSettings,
     TipTimes,
     at_rest,
+    attraction_hz,
+    current_a,
     feel,
     measure,
     rest_z_m,
@@ -103,6 +105,7 @@ class WorldSettings:
     signals: SignalSettings = field(default_factory=SignalSettings)
     iv: spectra.IVSettings = field(default_factory=spectra.IVSettings)
     force: spectra.ForceSettings = field(default_factory=spectra.ForceSettings)
+    z: spectra.ZSettings = field(default_factory=spectra.ZSettings)
     property_map: PropertyMapSettings = field(default_factory=PropertyMapSettings)
 
 
@@ -354,7 +357,10 @@ class World:
         feedback: Feedback | None = None,
         bias_v: float = 0.1,
     ) -> spectra.Curves:
-        """Return a curve at a position: (names, units, values [n_points, n_variables]). Kinds are "IV" and "force".
+        """Return a curve at a position: (names, units, values [n_points, n_variables]).
+
+        Kinds are "IV", "force" and "z" (current against z). An oscillating sensor adds its frequency shift to "IV" (a
+        Kelvin parabola) and "z". With the feedback off, a curve begins at the held z.
 
         Raises:
             InvalidValue: an unknown kind, or invalid feedback.
@@ -370,11 +376,38 @@ class World:
         relief = self.sample.relief(np.array([[x]]), np.array([[y]]), 0.0, t_s)
         material = float(relief.material[0, 0])
         random = chance.generator(self.seed, 3, call)
+        if kind == "force":
+            force = self.property_map.on_force(self.settings.force, x, y)
+            return spectra.force_distance(force, tip, material, random)
+        setup = self._setup(loop, bias_v, (0.0, 0.0), t_s)
+        loop, set_bias_v = setup.loop, bias_v if setup.set_bias_v is None else setup.set_bias_v
+        gap_m = self._gap_m(position_m, t_s, setup)
+        signals, noise, s = self.settings.signals, self.settings.noise, self.settings
         if kind == "IV":
-            iv, material = self.property_map.on_iv(self.settings.iv, material, x, y)
-            return spectra.current_voltage(iv, tip, material, bias_v, loop, random)
-        force = self.property_map.on_force(self.settings.force, x, y)
-        return spectra.force_distance(force, tip, material, random)
+            iv, material = self.property_map.on_iv(s.iv, material, x, y)
+            curves = spectra.current_voltage(iv, tip, material, set_bias_v, loop, random, gap_m)
+            from_set_m, swept_v = np.asarray(gap_m), curves[2][:, 0]
+        else:
+            of_material = np.asarray(material)
+            curves = spectra.over_z(
+                s.z,
+                lambda z: current_a(signals, loop, gap_m + z, of_material, bias_v, setup.set_bias_v),
+                noise.current_a,
+                random,
+            )
+            from_set_m, swept_v = gap_m + curves[2][:, 0], np.asarray(bias_v)
+        if not loop.settings.senses_shift:
+            return curves
+        contact_v = float(self._contact_v(np.asarray(material), np.asarray(x), np.asarray(y)))
+        shift_hz = attraction_hz(loop, tip, setup.sharp_m, from_set_m, swept_v, set_bias_v, contact_v)
+        return spectra.with_shift(curves, shift_hz, noise.frequency_hz, random)
+
+    def _gap_m(self, position_m: tuple[float, float], t_s: float, setup: Setup) -> float:
+        # of a tip that rests at a position
+        if setup.loop.on or setup.held.z_m is None:
+            return 0.0
+        course, _, felt = self._felt(position_m, t_s, setup)
+        return setup.held.z_m - rest_z_m(course, felt, replace(setup, held=replace(setup.held, z_m=None)))
 
     def property_truth(self, position_m: tuple[float, float], t_s: float) -> dict[str, object]:
         """Return the true value of the property map under a position, JSON-able; empty without a map."""
@@ -388,11 +421,12 @@ class World:
         """Return the fraction of values at which the preamplifier saturates, in a scan or in a kind of spectrum."""
         s = self.settings
         # the preamplifier's noise is added behind the clipping in a scan, and before it in a spectrum
-        limit_a = s.iv.preamplifier_a if kind else s.signals.preamplifier_a - 4.0 * s.noise.current_a
+        limit_a = s.iv.preamplifier_a if kind == "IV" else s.signals.preamplifier_a - 4.0 * s.noise.current_a
         return float((np.abs(current_a) >= limit_a).mean())
 
     def spectrum_s(self, kind: str) -> float:
-        return self.settings.iv.duration_s if kind == "IV" else self.settings.force.duration_s
+        s = self.settings
+        return {"IV": s.iv.duration_s, "z": s.z.duration_s}.get(kind, s.force.duration_s)
 
     def compensate(self, velocity_m_per_s: tuple[float, float], t_s: float) -> None:
         """Set the velocity (x, y) of the scanner's own drift compensation from `t_s` on.
