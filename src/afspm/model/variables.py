@@ -92,6 +92,8 @@ FOUND_BY_NAME: Final = VariableRoles.declared(
         CONDUCTANCE: ("dI/dV",),
         FORCE: ("Force",),
         FORCE + RETRACE: ("Force Retrace", "Force [bwd]"),
+        FREQUENCY_SHIFT: ("Frequency Shift", "OC M1 Freq. Shift"),
+        FREQUENCY_SHIFT + RETRACE: ("Frequency Shift Retrace", "OC M1 Freq. Shift [bwd]"),
         "deflection": ("Deflection", "Defl"),
         "deflection" + RETRACE: ("Deflection Retrace", "Deflection [bwd]"),
         TIME: ("Time",),

@@ -26,7 +26,9 @@ class SensorSettings:
     """The sensor of the mode "frequency-shift": the attraction of the sample shifts its resonance.
 
     For a sphere with van der Waals attraction, any amplitude A, and the distance d from the sample at the lower turning
-    point: shift = -f H R / (6 k (d (d + 2 A))^(3/2)) (Giessibl 1997).
+    point: shift = -f H R / (6 k (d (d + 2 A))^(3/2)) (Giessibl 1997). A voltage U between tip and sample, beyond their
+    contact potential, adds the attraction pi e0 R U^2 / d of a near sphere (Hudlet et al. 1998); averaged over the
+    oscillation: -f pi e0 R U^2 / (k A^2) ((d + A) / sqrt(d (d + 2 A)) - 1).
 
     Attributes:
         resonance_hz: resonance frequency far from the sample.
@@ -46,15 +48,36 @@ class SensorSettings:
     def __post_init__(self) -> None:
         check(self, above_zero="resonance_hz spring_n_per_m oscillation_m radius_m hamaker_j contact_m")
 
-    def shift_hz(self, distance_m: Array) -> Array:
-        """Return the frequency shift at distances from the sample: negative."""
+    def shift_hz(self, distance_m: Array | float, voltage_v: Array | float = 0.0) -> Array:
+        """Return the frequency shift at distances from the sample: negative.
+
+        Args:
+            voltage_v: voltage between tip and sample, minus their contact potential.
+        """
         nearest = np.maximum(distance_m, self.contact_m)
-        return np.asarray(-self._strength / (nearest * (nearest + 2.0 * self.oscillation_m)) ** 1.5)
+        product = nearest * (nearest + 2.0 * self.oscillation_m)
+        electric = np.square(voltage_v) * self._electric_hz * ((nearest + self.oscillation_m) / np.sqrt(product) - 1.0)
+        return np.asarray(-self._strength / product**1.5 - electric)
 
     def distance_m(self, shift_hz: float) -> float:
-        """Return the distance at which the resonance shifts by `shift_hz`, a negative value."""
+        """Return the distance at which the resonance shifts by `shift_hz`, a negative value, without a voltage."""
         squared = (self._strength / -shift_hz) ** (2.0 / 3.0)
         return math.sqrt(self.oscillation_m**2 + squared) - self.oscillation_m
+
+    def charged_distance_m(self, shift_hz: float, voltage_v: Array | float) -> Array:
+        """Return the distances at which the resonance shifts by `shift_hz`, a negative value, at these voltages."""
+        electric = np.maximum(np.square(voltage_v) * self._electric_hz, 1e-30)
+        # Between these bounds by bisection: beyond the first the attraction of van der Waals is too small alone, and
+        # beyond the second each of both attractions makes less than half of the shift.
+        near = np.broadcast_to(self.distance_m(shift_hz), np.shape(electric))
+        ratio = 1.0 + -shift_hz / (2.0 * electric)
+        far = self.oscillation_m * (ratio / np.sqrt(ratio**2 - 1.0) - 1.0)
+        far = np.maximum(far, self.distance_m(shift_hz / 2.0))
+        for _ in range(_BISECTIONS):
+            middle = (near + far) / 2.0
+            is_near = self.shift_hz(middle, voltage_v) < shift_hz
+            near, far = np.where(is_near, middle, near), np.where(is_near, far, middle)
+        return np.asarray((near + far) / 2.0)
 
     def slope_hz_per_m(self, distance_m: float) -> float:
         """Return the derivative of the frequency shift with respect to distance: positive."""
@@ -70,8 +93,18 @@ class SensorSettings:
     def _strength(self) -> float:
         return self.resonance_hz * self.hamaker_j * self.radius_m / (6.0 * self.spring_n_per_m)
 
+    @property
+    def _electric_hz(self) -> float:
+        # for a voltage of 1 V
+        force_m = math.pi * _VACUUM_F_PER_M * self.radius_m  # F d / U^2
+        return self.resonance_hz * force_m / (self.spring_n_per_m * self.oscillation_m**2)
+
 
 MODES = ("amplitude", "current", "frequency-shift")
+_VACUUM_F_PER_M = 8.8541878128e-12
+_BISECTIONS = 50
+LEAST_BIAS_V = 1e-6
+"""Where the feedback would need a smaller bias for the setpoint, the tip would be in contact."""
 _ONE_ATOM_S = 77.48e-6  # conductance of a contact of one atom, 2 e^2 / h
 _GENTLE = 0.3  # reduction of the free amplitude at a gentle setpoint
 _GENTLE_M = 1e-9  # distance of a sensor at a gentle frequency shift
@@ -124,6 +157,11 @@ class FeedbackSettings:
         check(self, from_zero="proportional_gain integral_gain hold_s")
         if refusal := self.refusal_of(self.first_setpoint):
             raise ConfigError(refusal, where="setpoint")
+
+    @property
+    def senses_shift(self) -> bool:
+        """True if the tip oscillates on a sensor of its frequency shift."""
+        return self.mode == "frequency-shift" or (self.mode == "current" and self.qplus)
 
     @property
     def first_setpoint(self) -> float:
@@ -195,7 +233,7 @@ class Loop:
 
         The conductance falls by e over each `decay_m`, from the conductance of a one-atom contact.
         """
-        conductance_s = self.setpoint / max(abs(bias_v), 1e-6)
+        conductance_s = self.setpoint / max(abs(bias_v), LEAST_BIAS_V)
         return self.settings.decay_m * math.log(max(_ONE_ATOM_S / conductance_s, 1.0))
 
     @property
@@ -247,10 +285,15 @@ class Loop:
         s = self.settings
         return np.clip(self.setpoint + gap_m / s.sensitivity_m_per_v, 0.0, s.free_amplitude_v)
 
-    def frequency_shift_hz(self, gap_m: Array) -> Array:
-        """Return the sensor's frequency shift; gap is z minus the height at which the setpoint is reached."""
-        sensor = self.settings.sensor
-        return sensor.shift_hz(sensor.distance_m(self.setpoint) + gap_m)
+    def distance_m(self, bias_v: float, contact_v: Array | float) -> Array:
+        """Return the distance from the sample at which the setpoint is reached, of a tunnelling tip or a sensor.
+
+        Args:
+            contact_v: the contact potential, which a frequency shift as a setpoint contains.
+        """
+        if self.settings.mode == "current":
+            return np.asarray(self.tunnelling_distance_m(bias_v))
+        return self.settings.sensor.charged_distance_m(self.setpoint, bias_v - contact_v)
 
     @property
     def oscillates(self) -> bool:

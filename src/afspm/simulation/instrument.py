@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 
@@ -64,6 +65,8 @@ class InstrumentSetup:
         region, shape: frame of the next scan, and its (rows, columns).
         line_s: seconds of trace and retrace together.
         upwards: True if the next scan begins with the smallest y.
+        bias_v: bias of the sample relative to the tip, everywhere in the simulation: at positive bias, electrons
+            tunnel into empty states of the sample.
         slope: tilt compensation (dz/dx, dz/dy), without unit.
         move_speed_m_s: speed of the probe outside of scans.
         approach_s: duration of an approach or a withdrawal.
@@ -246,7 +249,7 @@ class SimulatedInstrument:
         number = self._counts["scan"] + 1
         in_force, *later = self._adjustments(now_s)
         if later:
-            self.world.hold(self._surface_z_m(now_s))
+            self._remember(now_s)
         scan = ScanActivity(
             number,
             setup.region,
@@ -426,8 +429,14 @@ class SimulatedInstrument:
         self.world.hold(z_m)
 
     def switch_feedback(self, now_s: float, *, on: bool) -> None:
-        """Switch the feedback on or off, and count the time up to now in the ledger."""
+        """Switch the feedback on or off, and count the time up to now in the ledger.
+
+        Off, the tip stays at its z, and setpoint and bias of this moment stay those of this z.
+        """
         self.account(now_s)
+        if not on and self.setup.feedback.on is not False and self.engaged and self.doing(now_s) != "scan":
+            self.drawing.wait()
+            self._remember(now_s)
         self.setup.feedback = replace(self.setup.feedback, on=on)
         self.note_changes(now_s)
 
@@ -455,11 +464,10 @@ class SimulatedInstrument:
             Adjustment(self._held_until_s, setup.feedback, setup.bias_v),
         ]
 
-    def _surface_z_m(self, now_s: float) -> float:
-        # with random numbers of its own: those of the signals stay the same
-        random = np.random.default_rng((self.seed, 4, self._counts["spectrum"]))
-        at_rest = self.world.at_rest(self.probe_at(now_s), now_s, self.setup.feedback, self.setup.bias_v, random=random)
-        return at_rest["Height"]
+    def _remember(self, now_s: float) -> None:
+        setup = self.setup
+        with suppress(InvalidValue):  # an invalid feedback has met no surface
+            self.world.remember(self.probe_at(now_s), now_s, setup.feedback, setup.bias_v, slope=setup.slope)
 
     # -- the tip
 

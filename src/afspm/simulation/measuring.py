@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from afspm.model import Feedback
 from afspm.model.arrays import Array
-from afspm.simulation.feedback import Loop
+from afspm.simulation.feedback import LEAST_BIAS_V, Loop
 from afspm.simulation.imaging import SampleGrid, Sampler, across_m, felt, reach_m
 from afspm.simulation.noise import NoiseSettings, disturbances, flattened, height_noise
 from afspm.simulation.scanning import Course, ScannerSettings
@@ -23,7 +23,7 @@ from afspm.simulation.tip import TipShape
 
 @dataclass(frozen=True)
 class SignalSettings:
-    """The response of the sample in phase and current.
+    """The response of the sample in phase, current and frequency shift.
 
     Attributes:
         dissipation: energy lost to the sample per cycle, relative to the cantilever's own loss, mean of both materials.
@@ -32,6 +32,8 @@ class SignalSettings:
         conductance_contrast: ln of the ratio of both materials' conductances.
         current_decay_m: increase of the gap over which the tapping current falls by a factor e.
         preamplifier_a: current at which the amplifier saturates.
+        contact_potential_v: contact potential of both materials: the sample bias at the vertex of the parabola of the
+            frequency shift over the bias.
     """
 
     dissipation: float = 0.12
@@ -40,6 +42,7 @@ class SignalSettings:
     conductance_contrast: float = 1.5
     current_decay_m: float = 4e-9
     preamplifier_a: float = 10e-9
+    contact_potential_v: tuple[float, float] = (0.25, -0.1)
 
     def __post_init__(self) -> None:
         check(self, from_zero="dissipation conductance_s", above_zero="current_decay_m preamplifier_a")
@@ -56,12 +59,20 @@ def phase_deg(settings: SignalSettings, loop: Loop, amplitude_v: Array, material
     return np.asarray(np.degrees(np.arcsin(np.clip(share * (1.0 + lost), 0.0, 1.0))))
 
 
-def current_a(settings: SignalSettings, loop: Loop, gap_m: Array, material: Array, bias_v: float) -> Array:
-    """Return the tunnelling or tapping current, exponential in the gap."""
+def current_a(
+    settings: SignalSettings, loop: Loop, gap_m: Array, material: Array, bias_v: float, set_bias_v: float | None = None
+) -> Array:
+    """Return the tunnelling or tapping current, exponential in the gap and proportional to the bias at one gap.
+
+    Args:
+        gap_m: z minus the height at which the setpoint is reached.
+        set_bias_v: bias at which this height has the setpoint; None: the present bias, as while the feedback is on.
+    """
     contrast = settings.conductance_contrast * (material - 0.5)
     if loop.settings.mode == "current":
         # The feedback keeps the current constant, so conductance shows in the height; the current shows the error.
-        mean = np.copysign(loop.setpoint, bias_v)
+        share = np.sign(bias_v) if set_bias_v is None else bias_v / max(abs(set_bias_v), LEAST_BIAS_V)
+        mean = np.float64(loop.setpoint * share)
         exponent = -gap_m / loop.settings.decay_m
     else:
         mean = np.float64(settings.conductance_s * bias_v)
@@ -70,19 +81,32 @@ def current_a(settings: SignalSettings, loop: Loop, gap_m: Array, material: Arra
     return np.asarray(np.clip(current, -settings.preamplifier_a, settings.preamplifier_a))
 
 
-def attraction_hz(loop: Loop, tip: TipShape, sharp_m: float, gap_m: Array, bias_v: float) -> Array:
-    """Return the frequency shift of an oscillating, tunnelling tip; a blunt or double tip is attracted more.
+def attraction_hz(
+    loop: Loop,
+    tip: TipShape,
+    sharp_m: float,
+    gap_m: Array,
+    bias_v: Array | float,
+    set_bias_v: float,
+    contact_v: Array | float,
+) -> Array:
+    """Return the frequency shift of an oscillating tip; a blunt or double tunnelling tip is attracted more.
 
     Args:
         sharp_m: radius of the sharp tip, which corresponds to the sensor's `radius_m`.
         gap_m: z minus the height at which the setpoint is reached.
+        set_bias_v: bias at which this height has the setpoint.
+        contact_v: contact potential.
     """
-    sensor, distance_m = loop.settings.sensor, loop.tunnelling_distance_m(bias_v) + gap_m
+    sensor, distance_m = loop.settings.sensor, loop.distance_m(set_bias_v, contact_v) + gap_m
+    voltage_v = bias_v - contact_v
+    if loop.settings.mode == "frequency-shift":  # the setpoint is a shift of this tip, whichever its shape
+        return sensor.shift_hz(distance_m, voltage_v)
     of_radius = sensor.radius_m / sharp_m
-    shift = replace(sensor, radius_m=of_radius * tip.imaging_radius_m).shift_hz(distance_m)
+    shift = replace(sensor, radius_m=of_radius * tip.imaging_radius_m).shift_hz(distance_m, voltage_v)
     if tip.second_apex_m is not None:
         second = replace(sensor, radius_m=of_radius * tip.radius_m)
-        shift = shift + second.shift_hz(distance_m - tip.second_apex_m[2])
+        shift = shift + second.shift_hz(distance_m - tip.second_apex_m[2], voltage_v)
     return shift
 
 
@@ -98,6 +122,20 @@ _MOST_TAPS = 160
 
 
 @dataclass(frozen=True)
+class Held:
+    """The state that the feedback held last, in force while it is off.
+
+    Attributes:
+        z_m: z; None: not set.
+        setpoint, bias_v: of the feedback when it was on; they define the distance of the tip from the sample.
+    """
+
+    z_m: float | None
+    setpoint: float
+    bias_v: float
+
+
+@dataclass(frozen=True)
 class Setup:
     """The constant conditions of a scan.
 
@@ -106,7 +144,9 @@ class Setup:
         drift_m: returns the drift (x, y, z) minus the scanner's own compensation, at times.
         turn: returns rotation and scale of the sample at times, as complex factors.
         unturned: returns (x, y) without rotation and scale, from (x, y, times).
-        held_z_m: z while the feedback is off; None: not set.
+        bias_v: the present bias.
+        held: the state that the feedback held before it was switched off.
+        contact_v: returns the contact potential from (material, x, y), positions of the sample.
         slope: (x, y) compensation of tilt set on the instrument, m/m.
         sharp_m: radius of the sharp tip.
         offset_m: returns the remaining distance (x, y) of the scanner to its target (creep), at times.
@@ -126,9 +166,20 @@ class Setup:
     signals: SignalSettings
     loop: Loop
     bias_v: float
-    held_z_m: float | None
+    held: Held
+    contact_v: Callable[[Array, Array, Array], Array]
     slope: tuple[float, float]
     sharp_m: float
+
+    def __post_init__(self) -> None:
+        # heights are those of the setpoint in force, which is without effect while the feedback is off
+        if not self.loop.on:
+            object.__setattr__(self, "loop", replace(self.loop, setpoint=self.held.setpoint))
+
+    @property
+    def set_bias_v(self) -> float | None:
+        """The bias at which the heights have the setpoint; None: the present bias."""
+        return None if self.loop.on else self.held.bias_v
 
 
 @dataclass(frozen=True)
@@ -138,28 +189,38 @@ class Felt:
     Attributes:
         height_m: (trace, retrace), each [y, x].
         material: (trace, retrace), each [y, x], from 0 to 1.
+        contact_v: contact potential of the trace, [y, x].
     """
 
     height_m: tuple[Array, Array]
     material: tuple[Array, Array]
+    contact_v: Array
 
 
 @dataclass(frozen=True)
 class Measured:
-    """The channels of a scan, z at its end, and the mean indentation due to feedback errors."""
+    """The channels of a scan, z at the end of each line in the order of time, and the mean indentation.
+
+    The indentation is due to feedback errors.
+    """
 
     channels: Channels
-    last_z_m: float
+    ends_z_m: Array
     pressed_m: float
 
-    def continued(self, anew: Measured, rows: NDArray[np.bool_]) -> Measured:
-        """Return the measurement with `rows` taken from the first argument, the same scan with other settings."""
+    def continued(self, anew: Measured, rows: NDArray[np.bool_], lines: int) -> Measured:
+        """Return the measurement with `rows` taken from the first argument, the same scan with other settings.
+
+        Args:
+            lines: the number of lines before these rows.
+        """
         channels = {
             name: (unit, np.where(rows[:, None], anew.channels[name][1], values))
             for name, (unit, values) in self.channels.items()
         }
         share = float(rows.mean())
-        return Measured(channels, anew.last_z_m, share * anew.pressed_m + (1.0 - share) * self.pressed_m)
+        ends_z_m = np.concatenate([self.ends_z_m[:lines], anew.ends_z_m[lines:]])
+        return Measured(channels, ends_z_m, share * anew.pressed_m + (1.0 - share) * self.pressed_m)
 
 
 @dataclass(frozen=True)
@@ -198,7 +259,7 @@ def measure(course: Course, tips: TipTimes, setup: Setup, random: np.random.Gene
     line_tips = np.empty(course.shape[0], dtype=object)
     line_tips[order] = _tip_of_lines(course, tips)
     channels.update(_signals(gap_by_row, heights, line_tips, course, setup, random))
-    return Measured(channels, float(z[-1, -1]), float(np.maximum(-gap, 0.0).mean()))
+    return Measured(channels, z[:, -1], float(np.maximum(-gap, 0.0).mean()))
 
 
 def at_rest(course: Course, felt_m: Felt, tip: TipShape, setup: Setup, random: np.random.Generator) -> dict[str, float]:
@@ -208,9 +269,7 @@ def at_rest(course: Course, felt_m: Felt, tip: TipShape, setup: Setup, random: n
     """
     loop = setup.loop
     height = felt_m.height_m[0] + _tilt(course, (setup.scanner.tilt_x, setup.scanner.tilt_y))
-    z = height + (0.0 if loop.engages else loop.settings.range_m / 2)
-    if not loop.on and setup.held_z_m is not None:
-        z = np.full(height.shape, setup.held_z_m)
+    z = np.full(height.shape, rest_z_m(course, felt_m, setup))
     noise = setup.noise.white_m * random.standard_normal(height.shape)
     channels = {"Height": ("m", setup.scales[2] * z + noise - _tilt(course, setup.slope))}
     gap = z - height
@@ -218,6 +277,15 @@ def at_rest(course: Course, felt_m: Felt, tip: TipShape, setup: Setup, random: n
         gap = gap + _FLICKER_M * random.standard_normal(height.shape)
     channels.update(_signals(gap, felt_m, np.array([tip], dtype=object), course, setup, random))
     return {name: float(values[0, 0]) for name, (_, values) in channels.items()}
+
+
+def rest_z_m(course: Course, felt_m: Felt, setup: Setup) -> float:
+    """Return z at the single pixel of a course, with a settled feedback or as it was left."""
+    loop, held = setup.loop, setup.held
+    if not loop.on and held.z_m is not None:
+        return held.z_m
+    height = felt_m.height_m[0] + _tilt(course, (setup.scanner.tilt_x, setup.scanner.tilt_y))
+    return float(height[0, 0]) + (0.0 if loop.engages else loop.settings.range_m / 2)
 
 
 def feel(course: Course, tips: TipTimes, setup: Setup) -> Felt:
@@ -245,7 +313,7 @@ def feel(course: Course, tips: TipTimes, setup: Setup) -> Felt:
     times = [course.row_times_s(part) for part in (0.25, 0.75)]
     z_drift = np.stack([setup.drift_m(row_s)[:, 2:] + setup.settling_m(row_s)[:, None] for row_s in times])
     height += z_drift
-    return Felt((height[0], height[1]), (material[0], material[1]))
+    return Felt((height[0], height[1]), (material[0], material[1]), setup.contact_v(material[0], x[0], y[0]))
 
 
 def _sample_positions(course: Course, setup: Setup, part: float) -> tuple[Array, Array]:
@@ -319,7 +387,7 @@ def _z(lines: Array, course: Course, setup: Setup, random: np.random.Generator) 
     # z along the lines in time, trace then retrace; each starts from the end of the previous retrace
     loop = setup.loop
     if not loop.on:
-        return np.full(lines.shape, lines.max() if setup.held_z_m is None else setup.held_z_m)
+        return np.full(lines.shape, lines.max() if setup.held.z_m is None else setup.held.z_m)
     if not loop.engages:
         return np.full(lines.shape, lines.mean() + loop.settings.range_m / 2)
     nx = course.shape[1]
@@ -348,14 +416,15 @@ def _signals(
         phase = phase_deg(setup.signals, loop, amplitude, material, slope)
         channels["Amplitude"] = ("V", amplitude + white(noise.amplitude_v))
         channels["Phase"] = ("deg", phase + white(noise.phase_deg))
+    shift = np.empty((ny, nx))
+    set_bias_v = setup.bias_v if setup.set_bias_v is None else setup.set_bias_v
+    for tip in set(tips) if loop.settings.senses_shift else ():
+        rows, contact_v = tips == tip, heights.contact_v
+        shift[rows] = attraction_hz(loop, tip, setup.sharp_m, gap_m[rows], setup.bias_v, set_bias_v, contact_v[rows])
     if loop.settings.mode == "frequency-shift":
-        channels["Frequency Shift"] = ("Hz", loop.frequency_shift_hz(gap_m) + white(noise.frequency_hz))
-    current = current_a(setup.signals, loop, gap_m, material, setup.bias_v)
+        channels["Frequency Shift"] = ("Hz", shift + white(noise.frequency_hz))
+    current = current_a(setup.signals, loop, gap_m, material, setup.bias_v, setup.set_bias_v)
     channels["Current"] = ("A", current + white(noise.current_a))
     if loop.settings.mode == "current" and loop.settings.qplus:
-        shift = np.empty((ny, nx))
-        for tip in set(tips):
-            rows = tips == tip
-            shift[rows] = attraction_hz(loop, tip, setup.sharp_m, gap_m[rows], setup.bias_v)
         channels["Frequency Shift"] = ("Hz", shift + white(noise.frequency_hz))
     return channels

@@ -38,6 +38,7 @@ QUANTITIES: Final = {
     "gap": Quantity("IV", "eV", 0.4, 1.4),
     "modulus": Quantity("force", "Pa", 1e9, 6e9),
     "adhesion": Quantity("force", "J/m^2", 0.02, 0.1),
+    "contact_potential": Quantity("IV", "V", -0.3, 0.3),
 }
 _STEEPNESS = 1.6  # of the logistic curve that keeps a field within its range: 90 % of it is used
 _REACH = 3.0  # of a spot, in its half-widths: less than 0.002 of its height is left there
@@ -49,7 +50,8 @@ class PropertyMapSettings:
 
     Attributes:
         kind: "none", "smooth" (hills and valleys everywhere) or "spotty" (round spots on a uniform background).
-        quantity: "gap" of I(V) curves in eV, "modulus" of force curves in Pa, or their "adhesion" in J/m^2.
+        quantity: "gap" of I(V) curves in eV, "modulus" of force curves in Pa, or their "adhesion" in J/m^2, or the
+            "contact_potential" in V, which an oscillating sensor feels in I(V) curves and in scans.
         low, high: range of the quantity, in its unit; if both are equal, the usual range of the quantity.
         size_m: width of hills, or mean width of spots at half their height.
         spacing_m: mean distance of spots.
@@ -67,7 +69,7 @@ class PropertyMapSettings:
     def __post_init__(self) -> None:
         one_of(self.kind, KINDS, "kind")
         one_of(self.quantity, QUANTITIES, "quantity")
-        check(self, above_zero="size_m spacing_m", from_zero="low")
+        check(self, above_zero="size_m spacing_m", from_zero="" if self.quantity == "contact_potential" else "low")
         if self.high < self.low:
             raise ConfigError(f"{self.high!r} is below low = {self.low!r}", where="high")
         if not 2.0 <= self.spot_exponent <= 20.0:

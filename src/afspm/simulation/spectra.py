@@ -1,8 +1,9 @@
-"""Curves at a point: current against bias, and force against distance."""
+"""Curves at a point: current and frequency shift against bias or z, and force against distance."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,11 +13,13 @@ from afspm.simulation.feedback import Loop
 from afspm.simulation.settings import check
 from afspm.simulation.tip import TipShape
 
-KINDS = ("IV", "force")
+KINDS = ("IV", "force", "z")
 Curves = tuple[tuple[str, ...], tuple[str, ...], Array]
 """Names, units, values [n_points, n_variables]."""
 
-_KT_EV = 0.0257
+_BOLTZMANN_EV_PER_K = 8.617333e-5
+_TAILS = 15.0  # of the Fermi function, in kT
+_PHASES = 64  # of the modulation, at which the lock-in amplifier is computed
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,10 @@ class IVSettings:
         noise_a: white noise of the current.
         relative_noise: additional noise as a fraction of the current.
         duration_s: duration of a curve.
+        temperature_k: temperature of tip and sample, which broadens dI/dV by 3.5 kT.
+        modulation_v: peak amplitude of the lock-in amplifier's modulation, which broadens dI/dV by 1.73 times as much.
+        time_constant_s: time constant of the lock-in amplifier (6 dB per octave); dI/dV lags by it.
+        noise_density_a: noise of the current around the frequency of the modulation, in A per square root of Hz.
     """
 
     points: int = 256
@@ -45,10 +52,16 @@ class IVSettings:
     relative_noise: float = 0.005
     preamplifier_a: float = 10e-9
     duration_s: float = 2.0
+    temperature_k: float = 298.0
+    modulation_v: float = 20e-3
+    time_constant_s: float = 2.5e-3
+    noise_density_a: float = 1.4e-15
 
     def __post_init__(self) -> None:
-        check(self, above_zero="points range_v set_current_a barrier_ev preamplifier_a duration_s")
-        check(self, from_zero="gap_ev noise_a relative_noise")
+        check(self, above_zero="points range_v set_current_a barrier_ev preamplifier_a duration_s temperature_k")
+        check(
+            self, above_zero="modulation_v time_constant_s", from_zero="gap_ev noise_a relative_noise noise_density_a"
+        )
 
 
 @dataclass(frozen=True)
@@ -79,46 +92,141 @@ class ForceSettings:
         check(self, from_zero="noise_m", fraction="approach_share")
 
 
-def current_voltage(
-    settings: IVSettings, tip: TipShape, material: float, bias_v: float, loop: Loop, random: np.random.Generator
-) -> Curves:
-    """Return I(V), forward and backward, and dI/dV as a lock-in amplifier measures it.
+@dataclass(frozen=True)
+class ZSettings:
+    """Sweep of current and frequency shift against z, relative to z at the start.
 
-    The current is the integral of the densities of states of sample and tip times the transmission of the barrier,
-    scaled to the current that the feedback held before.
+    Attributes:
+        nearest_m, farthest_m: the sweep goes from `nearest_m` (below zero: towards the sample) to `farthest_m`.
+        duration_s: duration of a curve.
+    """
+
+    points: int = 256
+    nearest_m: float = -0.1e-9
+    farthest_m: float = 2e-9
+    duration_s: float = 2.0
+
+    def __post_init__(self) -> None:
+        check(self, above_zero="points farthest_m duration_s")
+
+
+def current_voltage(
+    settings: IVSettings,
+    tip: TipShape,
+    material: float,
+    bias_v: float,
+    loop: Loop,
+    random: np.random.Generator,
+    gap_m: float = 0.0,
+) -> Curves:
+    """Return I(V), forward and backward, and dI/dV as a lock-in amplifier measures it during the forward sweep.
+
+    The current is the integral of the densities of states of sample and tip times the transmission of the barrier, at
+    a temperature (`thermal_current`), scaled to the current that the feedback held before.
+
+    Args:
+        bias_v: bias at which the feedback held the setpoint.
+        gap_m: z minus the height at which the setpoint is reached.
     """
     bias = np.linspace(-settings.range_v, settings.range_v, settings.points)
-    energy = np.linspace(-settings.range_v - 0.5, settings.range_v + 0.5, 1201)
+    kt_ev = _BOLTZMANN_EV_PER_K * settings.temperature_k
+    beyond = settings.range_v + settings.modulation_v + _TAILS * kt_ev
+    finest = min(kt_ev, settings.modulation_v) / 4.0
+    energy = np.linspace(-beyond, beyond, min(20_001, max(1201, 2 * math.ceil(beyond / finest) + 1)))
     density = _sample_density(settings, energy, material) * _tip_density(tip, energy)
     # Transmission rises with the energy above the mean barrier; the bias tilts it: currents at positive and
     # negative bias differ, more for a flawed tip.
     tilt = 0.25 + (0.35 if tip.debris_m else 0.0)
     density = density * np.exp(tilt * energy / math.sqrt(settings.barrier_ev))
-    step = energy[1] - energy[0]
-    from_zero = np.cumsum(density) * step
-    from_zero -= np.interp(0.0, energy, from_zero)
-    current = np.interp(bias, energy, from_zero)
+    current = thermal_current(energy, density, kt_ev)
     tunnels = loop.settings.mode == "current"
-    held = loop.setpoint if tunnels else settings.set_current_a
-    at_bias = abs(float(np.interp(bias_v if tunnels else settings.set_bias_v, energy, from_zero)))
-    scale = held / max(at_bias, 1e-3 * float(np.abs(current).max()), 1e-30)
-    clean = current * scale
-    sweeps = [_through_preamplifier(settings, clean, tip, random) for _ in range(2)]
-    lock_in = np.interp(bias, energy, density) * scale
-    lock_in = lock_in + settings.noise_a * 2.0 * random.standard_normal(settings.points)
+    held = loop.setpoint * math.exp(-gap_m / loop.settings.decay_m) if tunnels else settings.set_current_a
+    at_bias = abs(float(np.interp(bias_v if tunnels else settings.set_bias_v, energy, current)))
+    largest = float(np.abs(np.interp(bias, energy, current)).max())
+    current *= held / max(at_bias, 1e-3 * largest, 1e-30)
+    sweeps = [_through_preamplifier(settings, np.interp(bias, energy, current), tip, random) for _ in range(2)]
+    clipped = np.clip(current, -settings.preamplifier_a, settings.preamplifier_a)
+    dwell_s = settings.duration_s / (2.0 * settings.points)
+    noise_a = settings.noise_density_a * random.standard_normal(settings.points)
+    lock_in = lock_in_s(bias, energy, clipped, settings.modulation_v, settings.time_constant_s, dwell_s, noise_a)
     return ("Bias", "Current", "Current Retrace", "dI/dV"), ("V", "A", "A", "S"), np.stack([bias, *sweeps, lock_in], 1)
+
+
+def thermal_current(energy_ev: Array, density: Array, kt_ev: float) -> Array:
+    """Return the current at biases equal to these evenly spaced energies, 0 at 0 V, in units of the density.
+
+    The Fermi functions of tip and sample bound the window of energies: dI/dV is the density, convolved with the
+    derivative of the Fermi function, whose full width at half maximum is 3.5 kT.
+    """
+    step = energy_ev[1] - energy_ev[0]
+    half = min(math.ceil(_TAILS * kt_ev / step), len(energy_ev) // 2 - 1)
+    edges = (np.arange(-half, half + 2) - 0.5) * step
+    kernel = np.diff(0.5 * (1.0 + np.tanh(edges / (2.0 * kt_ev))))
+    sharp = np.cumsum((density + np.roll(density, 1)) / 2.0) * step
+    current = np.convolve(np.pad(sharp, half, mode="edge"), kernel / kernel.sum(), mode="valid")
+    return np.asarray(current - np.interp(0.0, energy_ev, current))
+
+
+def lock_in_s(
+    bias_v: Array,
+    energy_ev: Array,
+    current_a: Array,
+    modulation_v: float,
+    time_constant_s: float,
+    dwell_s: float,
+    noise_a: Array,
+) -> Array:
+    """Return dI/dV as a lock-in amplifier shows it along a sweep: the first harmonic of a modulated current.
+
+    A modulation of peak amplitude V broadens a peak by a half circle of radius V (Klein et al. 1973). A low-pass of the
+    first order with time constant t lets pass the bandwidth 1 / (4 t).
+
+    Args:
+        bias_v: the biases of the sweep, in the order of time, each for `dwell_s`.
+        energy_ev, current_a: the current behind the preamplifier at biases.
+        noise_a: noise in A per square root of Hz, times a normal random number for each bias.
+    """
+    phases = np.cos((np.arange(_PHASES) + 0.5) * (2.0 * math.pi / _PHASES))
+    seen = np.interp(bias_v[:, None] + modulation_v * phases, energy_ev, current_a)
+    harmonic_a = 2.0 * (seen * phases).mean(axis=1)
+    part = -math.expm1(-dwell_s / time_constant_s)
+    # the low-pass leaves part / (2 - part) of the power of white noise
+    noise_v = np.sqrt(2.0) * noise_a * math.sqrt((2.0 - part) / part / (4.0 * time_constant_s))
+    shown = np.empty_like(bias_v)
+    low_pass = harmonic_a[0] + noise_v[0] * math.sqrt(part / (2.0 - part))
+    for n, value in enumerate(harmonic_a + noise_v):
+        shown[n] = low_pass = low_pass + (part * (value - low_pass) if n else 0.0)
+    return shown / modulation_v
+
+
+def over_z(
+    settings: ZSettings, current_a: Callable[[Array], Array], noise_a: float, random: np.random.Generator
+) -> Curves:
+    """Return the current against z, relative to z at the start, both ways; `current_a` is without its noise."""
+    z = np.linspace(settings.nearest_m, settings.farthest_m, settings.points)
+    there, back = (current_a(z) + noise_a * random.standard_normal(settings.points) for _ in range(2))
+    return ("Z", "Current", "Current Retrace"), ("m", "A", "A"), np.stack([z, there, back], 1)
+
+
+def with_shift(curves: Curves, shift_hz: Array, noise_hz: float, random: np.random.Generator) -> Curves:
+    """Return the curves of an oscillating sensor, which measures its frequency shift at each point as well."""
+    names, units, values = curves
+    both = (shift_hz + noise_hz * random.standard_normal(len(values)) for _ in range(2))
+    added = ("Frequency Shift", "Frequency Shift Retrace")
+    return (*names, *added), (*units, "Hz", "Hz"), np.column_stack([values, *both])
 
 
 def force_distance(settings: ForceSettings, tip: TipShape, material: float, random: np.random.Generator) -> Curves:
     """Return deflection and force against z, approach and retract; z is 0 where the unbent cantilever touches.
 
-    The contact follows Derjaguin, Muller and Toporov; before contact, van der Waals attraction acts. Quasi-static: the
+    The contact follows Derjaguin, Muller and Toporov (1975): the pull-off force is 2 pi R w for a work of adhesion w.
+    Before contact, van der Waals attraction acts. Quasi-static: the
     cantilever follows a branch until its end, then jumps (snap-in, pull-off), so both directions differ.
     """
     modulus = _mix(settings.modulus_pa, material, logarithmic=True)
     adhesion = _mix(settings.adhesion_j_per_m2, material) * (1.4 if tip.debris_m else 1.0)
     radius, spring = tip.imaging_radius_m, settings.spring_n_per_m
-    pull_off = 4.0 * math.pi * radius * adhesion
+    pull_off = 2.0 * math.pi * radius * adhesion
     deepest = ((settings.trigger_n + 2.0 * pull_off) / (4.0 / 3.0 * modulus * math.sqrt(radius))) ** (2.0 / 3.0)
     distance = np.concatenate([
         np.linspace(-deepest, 0.0, 1500, endpoint=False),
@@ -140,8 +248,7 @@ def force_distance(settings: ForceSettings, tip: TipShape, material: float, rand
 def _sample_density(settings: IVSettings, energy: Array, material: float) -> Array:
     # `material` from 0 (semiconductor) to 1 (metal)
     gap = settings.gap_ev * (1.0 - 0.3 * material)
-    outside = np.abs(energy - settings.band_offset_ev) - gap / 2
-    bands = np.sqrt(np.log1p(np.exp(np.clip(outside / (2 * _KT_EV), -60, 60))) * 2 * _KT_EV)
+    bands = np.sqrt(np.maximum(np.abs(energy - settings.band_offset_ev) - gap / 2, 0.0))
     metal = 0.7 + 0.12 * energy + 0.25 * np.exp(-(((energy + 0.45) / 0.12) ** 2))
     share = material**2
     return np.asarray((1.0 - share) * bands + share * metal + 1e-3)
@@ -182,9 +289,11 @@ def _followed(z: Array, distance: Array, force: Array, spring: float, *, approac
     # the branch depends on history: approaching from afar, or retracting from contact
     # In equilibrium z = distance - deflection; where that is not monotonic the branch ends.
     extension = distance - force / spring
-    if approaching:
-        reached = np.minimum.accumulate(extension[::-1])  # falls on the way in
-        index = np.searchsorted(-reached, -z, side="left")
-        return np.asarray(force[::-1][np.minimum(index, len(force) - 1)])
+    if approaching:  # the same with the sign of z turned
+        z, extension, force = -z, -extension[::-1], force[::-1]
     reached = np.maximum.accumulate(extension)
-    return np.asarray(force[np.minimum(np.searchsorted(reached, z, side="left"), len(force) - 1)])
+    after = np.clip(np.searchsorted(reached, z, side="left"), 1, len(force) - 1)
+    before = after - 1
+    share = np.clip((z - extension[before]) / (extension[after] - extension[before]), 0.0, 1.0)
+    share[extension[before] < reached[before]] = 1.0  # beyond the end of a branch
+    return np.asarray(force[before] + share * (force[after] - force[before]))

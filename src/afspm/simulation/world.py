@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,7 +21,20 @@ from afspm.model.snapshot import restored, snapshot
 from afspm.simulation import chance, spectra
 from afspm.simulation.drift import DriftSettings, ScannerCompensation
 from afspm.simulation.feedback import FeedbackSettings, Loop
-from afspm.simulation.measuring import Adjustment, Felt, Setup, SignalSettings, TipTimes, at_rest, feel, measure
+from afspm.simulation.measuring import (
+    Adjustment,
+    Felt,
+    Held,
+    Setup,
+    SignalSettings,
+    TipTimes,
+    at_rest,
+    attraction_hz,
+    current_a,
+    feel,
+    measure,
+    rest_z_m,
+)
 from afspm.simulation.noise import NoiseSettings
 from afspm.simulation.property_map import PropertyMap, PropertyMapSettings
 from afspm.simulation.sample import Sample, SurfaceMark
@@ -92,6 +105,7 @@ class WorldSettings:
     signals: SignalSettings = field(default_factory=SignalSettings)
     iv: spectra.IVSettings = field(default_factory=spectra.IVSettings)
     force: spectra.ForceSettings = field(default_factory=spectra.ForceSettings)
+    z: spectra.ZSettings = field(default_factory=spectra.ZSettings)
     property_map: PropertyMapSettings = field(default_factory=PropertyMapSettings)
 
 
@@ -137,9 +151,10 @@ def _named_scanner(tables: dict[str, object], errors: ErrorCollector) -> Mapping
     return SCANNERS.get(str(name), {})
 
 
-STATE_VERSION = 3
+STATE_VERSION = 4
 _POINT_M = 1e-12
 _SAME_PLACE_M = 20e-12
+_FIRST_BIAS_V = 0.1
 
 
 @dataclass(frozen=True)
@@ -154,7 +169,7 @@ class WorldState:
     came_from_m: tuple[float, float]
     came_s: float
     moves: list[tuple[float, float, float]]
-    held_z_m: float | None
+    held: Held
     tips: list[TipChange]
     marks: list[SurfaceMark]
     compensation: list[tuple[float, float, float, float, float]]
@@ -174,7 +189,7 @@ class World:
         self._calls = 0
         self._place = ScannerPlace(self.settings.scanner, start_s)
         self._scales = self.settings.scanner.scales(seed)
-        self._held_z_m: float | None = None
+        self._held = Held(None, self.settings.feedback.first_setpoint, _FIRST_BIAS_V)
         self._felt_at_rest: tuple[object, Felt] | None = None
 
     @classmethod
@@ -227,11 +242,17 @@ class World:
         setup = self._setup(loop, bias_v, slope, start_s)
         measured = measure(course, tips, setup, chance.generator(self.seed, 2, call))
         # the whole scan is computed with each adjustment and the same noise; then its lines are taken over
+        self._hold_conditions(loop, bias_v)
         for one in adjusted:
-            setup = self._setup(Loop.of(self.settings.feedback, one.feedback), one.bias_v, slope, start_s)
+            rows = course.row_times_s(0.0) >= one.t_s
+            if lines := len(rows) - int(np.count_nonzero(rows)):
+                self._held = replace(self._held, z_m=float(measured.ends_z_m[lines - 1]))
+            loop = Loop.of(self.settings.feedback, one.feedback)
+            setup = self._setup(loop, one.bias_v, slope, start_s)
             anew = measure(course, tips, setup, chance.generator(self.seed, 2, call))
-            measured = measured.continued(anew, course.row_times_s(0.0) >= one.t_s)
-        self._held_z_m = measured.last_z_m
+            measured = measured.continued(anew, rows, lines)
+            self._hold_conditions(loop, one.bias_v)
+        self._held = replace(self._held, z_m=float(measured.ends_z_m[-1]))
         self._tip.wear(course, loop)
         drift = self.sample.drift.at(course.row_times_s(0.25))
         truth = {
@@ -255,8 +276,9 @@ class World:
     ) -> dict[str, float]:
         """Return the value of each channel while the tip stands still, without changing the world.
 
-        With the feedback off, z is the value set by `hold`, or z at the end of the last scan; before the first scan and
-        after a crash, z is the height of the surface.
+        With the feedback off, z is the value set by `hold`, or z when it was switched off (`remember`), or at the end
+        of the last scan; before all of these and after a crash, z is the height of the surface. Setpoint and bias that
+        the feedback held then define the distance of the tip from the sample.
 
         Args:
             random: generator for the noise, so that other measurements stay the same.
@@ -267,8 +289,12 @@ class World:
         if not all(map(math.isfinite, (bias_v, *slope, *position_m))):
             raise InvalidValue(f"bias {bias_v} V, slope {slope} and position {position_m} must be finite")
         loop = Loop.of(self.settings.feedback, feedback)
-        course = Course(Region(position_m, (_POINT_M, _POINT_M)), (1, 1), 1e-3, t_s)
         setup = self._setup(loop, bias_v, slope, t_s)
+        course, tip, felt = self._felt(position_m, t_s, setup)
+        return at_rest(course, felt, tip, setup, random)
+
+    def _felt(self, position_m: tuple[float, float], t_s: float, setup: Setup) -> tuple[Course, TipShape, Felt]:
+        course = Course(Region(position_m, (_POINT_M, _POINT_M)), (1, 1), 1e-3, t_s)
         tip = self._tip.at(t_s)
         settling_m = float(self._place.settling_m(np.array([t_s]))[0])
         where_m = (*self.under(position_m, t_s), self.sample.seen_drift_m(t_s)[2] + settling_m)
@@ -276,7 +302,30 @@ class World:
         key = (where, tip, len(self.sample.marks))
         if self._felt_at_rest is None or self._felt_at_rest[0] != key:
             self._felt_at_rest = key, feel(course, [(t_s, tip)], setup)
-        return at_rest(course, self._felt_at_rest[1], tip, setup, random)
+        return course, tip, self._felt_at_rest[1]
+
+    def remember(
+        self,
+        position_m: tuple[float, float],
+        t_s: float,
+        feedback: Feedback,
+        bias_v: float,
+        *,
+        slope: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        """Remember z, setpoint and bias of a feedback that is switched off at a position now.
+
+        Raises:
+            InvalidValue: invalid feedback.
+        """
+        loop = Loop.of(self.settings.feedback, replace(feedback, on=True))
+        setup = self._setup(loop, bias_v, slope, t_s)
+        course, _, felt = self._felt(position_m, t_s, setup)
+        self._held = Held(rest_z_m(course, felt, setup), loop.setpoint, bias_v)
+
+    def _hold_conditions(self, loop: Loop, bias_v: float) -> None:
+        if loop.on:
+            self._held = replace(self._held, setpoint=loop.setpoint, bias_v=bias_v)
 
     def hold(self, z_m: float) -> None:
         """Set z while the feedback is off.
@@ -286,7 +335,7 @@ class World:
         """
         if not math.isfinite(z_m):
             raise InvalidValue(f"z can't be held at {z_m} m")
-        self._held_z_m = z_m / self._scales[2]
+        self._held = replace(self._held, z_m=z_m / self._scales[2])
 
     def move_to(self, position_m: tuple[float, float], t_s: float) -> None:
         """Move the scanner to a position that it reaches at `t_s`; its creep begins then."""
@@ -308,7 +357,10 @@ class World:
         feedback: Feedback | None = None,
         bias_v: float = 0.1,
     ) -> spectra.Curves:
-        """Return a curve at a position: (names, units, values [n_points, n_variables]). Kinds are "IV" and "force".
+        """Return a curve at a position: (names, units, values [n_points, n_variables]).
+
+        Kinds are "IV", "force" and "z" (current against z). An oscillating sensor adds its frequency shift to "IV" (a
+        Kelvin parabola) and "z". With the feedback off, a curve begins at the held z.
 
         Raises:
             InvalidValue: an unknown kind, or invalid feedback.
@@ -324,11 +376,38 @@ class World:
         relief = self.sample.relief(np.array([[x]]), np.array([[y]]), 0.0, t_s)
         material = float(relief.material[0, 0])
         random = chance.generator(self.seed, 3, call)
+        if kind == "force":
+            force = self.property_map.on_force(self.settings.force, x, y)
+            return spectra.force_distance(force, tip, material, random)
+        setup = self._setup(loop, bias_v, (0.0, 0.0), t_s)
+        loop, set_bias_v = setup.loop, bias_v if setup.set_bias_v is None else setup.set_bias_v
+        gap_m = self._gap_m(position_m, t_s, setup)
+        signals, noise, s = self.settings.signals, self.settings.noise, self.settings
         if kind == "IV":
-            iv, material = self.property_map.on_iv(self.settings.iv, material, x, y)
-            return spectra.current_voltage(iv, tip, material, bias_v, loop, random)
-        force = self.property_map.on_force(self.settings.force, x, y)
-        return spectra.force_distance(force, tip, material, random)
+            iv, material = self.property_map.on_iv(s.iv, material, x, y)
+            curves = spectra.current_voltage(iv, tip, material, set_bias_v, loop, random, gap_m)
+            from_set_m, swept_v = np.asarray(gap_m), curves[2][:, 0]
+        else:
+            of_material = np.asarray(material)
+            curves = spectra.over_z(
+                s.z,
+                lambda z: current_a(signals, loop, gap_m + z, of_material, bias_v, setup.set_bias_v),
+                noise.current_a,
+                random,
+            )
+            from_set_m, swept_v = gap_m + curves[2][:, 0], np.asarray(bias_v)
+        if not loop.settings.senses_shift:
+            return curves
+        contact_v = float(self._contact_v(np.asarray(material), np.asarray(x), np.asarray(y)))
+        shift_hz = attraction_hz(loop, tip, setup.sharp_m, from_set_m, swept_v, set_bias_v, contact_v)
+        return spectra.with_shift(curves, shift_hz, noise.frequency_hz, random)
+
+    def _gap_m(self, position_m: tuple[float, float], t_s: float, setup: Setup) -> float:
+        # of a tip that rests at a position
+        if setup.loop.on or setup.held.z_m is None:
+            return 0.0
+        course, _, felt = self._felt(position_m, t_s, setup)
+        return setup.held.z_m - rest_z_m(course, felt, replace(setup, held=replace(setup.held, z_m=None)))
 
     def property_truth(self, position_m: tuple[float, float], t_s: float) -> dict[str, object]:
         """Return the true value of the property map under a position, JSON-able; empty without a map."""
@@ -342,11 +421,12 @@ class World:
         """Return the fraction of values at which the preamplifier saturates, in a scan or in a kind of spectrum."""
         s = self.settings
         # the preamplifier's noise is added behind the clipping in a scan, and before it in a spectrum
-        limit_a = s.iv.preamplifier_a if kind else s.signals.preamplifier_a - 4.0 * s.noise.current_a
+        limit_a = s.iv.preamplifier_a if kind == "IV" else s.signals.preamplifier_a - 4.0 * s.noise.current_a
         return float((np.abs(current_a) >= limit_a).mean())
 
     def spectrum_s(self, kind: str) -> float:
-        return self.settings.iv.duration_s if kind == "IV" else self.settings.force.duration_s
+        s = self.settings
+        return {"IV": s.iv.duration_s, "z": s.z.duration_s}.get(kind, s.force.duration_s)
 
     def compensate(self, velocity_m_per_s: tuple[float, float], t_s: float) -> None:
         """Set the velocity (x, y) of the scanner's own drift compensation from `t_s` on.
@@ -413,7 +493,7 @@ class World:
         radius = 3.0 * math.sqrt(2.0 * tip.imaging_radius_m * into_m) * random.uniform(0.8, 1.4)
         outcome = self._tip.crash(depth_m, speed_m_s, t_s, random)
         self.sample.mark("crash", self._true_m(position_m, t_s), t_s, into_m * random.uniform(0.6, 0.9), radius)
-        self._held_z_m = None
+        self._held = replace(self._held, z_m=None)
         return outcome
 
     def drift_m(self, t_s: ArrayLike) -> Array:
@@ -460,7 +540,7 @@ class World:
             came_from_m=self._place.came_from_m,
             came_s=self._place.came_s,
             moves=self._place.moves,
-            held_z_m=self._held_z_m,
+            held=self._held,
             tips=self._tip.history,
             marks=self.sample.marks,
             compensation=self.sample.compensation.turns,
@@ -478,7 +558,7 @@ class World:
             theirs, mine = getattr(found, name), getattr(self, name)
             if theirs != mine:
                 raise InvalidValue(f"a saved state with {name} {theirs!r} instead of {mine!r}")
-        self._calls, self._held_z_m = found.calls, found.held_z_m
+        self._calls, self._held = found.calls, found.held
         self._place.at_m, self._place.came_from_m, self._place.came_s = found.at_m, found.came_from_m, found.came_s
         self._place.moves = found.moves
         self._tip.history, self._tip.scheduled_until_s = found.tips, found.scheduled_until_s
@@ -509,10 +589,17 @@ class World:
             signals=self.settings.signals,
             loop=loop,
             bias_v=bias_v,
-            held_z_m=self._held_z_m,
+            held=self._held,
+            contact_v=self._contact_v,
             slope=slope,
             sharp_m=self.settings.tip.radius_m,
         )
+
+    def _contact_v(self, material: Array, x_m: Array, y_m: Array) -> Array:
+        if self.property_map.quantity == "contact_potential" and self.property_map.is_on:
+            return self.property_map.at(x_m, y_m)
+        low, high = self.settings.signals.contact_potential_v
+        return low + (high - low) * material
 
 
 def _truth_of_scan(sample: Sample, course: Course, tips: TipTimes) -> dict[str, object]:

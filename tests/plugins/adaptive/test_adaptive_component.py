@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from afspm.basics import ConfigError, ExitCode, InvalidValue, MeasurementFailed
 from afspm.emulation import World
 from afspm.model import ControlRequest, Region, Request, Spectrum
 from afspm.plugins.adaptive import Adaptive
-from afspm.plugins.adaptive.quantities import adhesion_n, evaluation, gap_ev
+from afspm.plugins.adaptive.quantities import adhesion_n, evaluation, gap_ev, kelvin_parabola
 
 HERE = "tests.plugins.adaptive.test_adaptive_component"
 
@@ -191,8 +191,82 @@ def test_gap_of_a_noisy_curve_is_the_one_of_the_map(surface: str) -> None:
     true = world.property_map.at(places, 0.0)
     found = np.array([gap_ev(spectrum_at(world, "IV", x)) for x in places])
     assert np.ptp(true) > 0.4
-    assert found == pytest.approx(true, abs=0.08)
-    assert np.std(found - true) < 0.02
+    assert found == pytest.approx(true, abs=0.008)
+    assert np.std(found - true) < 0.003
+
+
+# results F12: the gap was 20 to 105 meV too small, by its size and the range of the bias
+@pytest.mark.parametrize("gap", [0.4, 0.9, 1.4])
+@pytest.mark.parametrize(
+    "sweep",
+    [
+        {},
+        {"points": 64},
+        {"points": 128, "range_v": 1.2},
+        {"points": 1000, "temperature_k": 4.2, "modulation_v": 2e-3},
+        {"modulation_v": 0.1},
+    ],
+    ids=["default", "few points", "short", "cold", "large modulation"],
+)
+def test_gap_is_true_at_any_broadening(gap: float, sweep: dict[str, float]) -> None:
+    world = World.from_settings(
+        {"property_map": {"kind": "smooth", "low": gap, "high": gap + 1e-6}, "iv": sweep}, 3, 0.0
+    )
+    found = [gap_ev(spectrum_at(world, "IV", 1e-8 * n)) for n in range(5)]
+    assert np.mean(found) == pytest.approx(gap, abs=0.006)
+
+
+def test_gap_is_true_where_the_preamplifier_is_saturated() -> None:
+    settings = {"property_map": {"kind": "smooth", "low": 1.0, "high": 1.000001}, "feedback": {"mode": "current"}}
+    curve = spectrum_at(World.from_settings(settings, 3, 0.0), "IV", 0.0)
+    assert np.mean(np.abs(curve["Current"]) == 10e-9) > 0.2
+    assert gap_ev(curve) == pytest.approx(1.0, abs=0.01)
+
+
+def kelvin_world(**settings: object) -> World:
+    sensor = {"resonance_hz": 30e3, "spring_n_per_m": 1800.0, "oscillation_m": 100e-12}
+    feedback = {"mode": "current", "qplus": True, "sensor": sensor}
+    return World.from_settings({"surface": "flat", "feedback": feedback, **settings}, 3, 0.0)
+
+
+def test_contact_potential_of_a_curve_is_the_one_of_the_map_within_its_error() -> None:
+    world = kelvin_world(property_map={"kind": "smooth", "quantity": "contact_potential"}, noise={"frequency_hz": 0.5})
+    places = np.linspace(-5e-7, 5e-7, 200)
+    true = world.property_map.at(places, 0.0)
+    fits = [kelvin_parabola(spectrum_at(world, "IV", x)) for x in places]
+    away = np.array([fit.vertex_v for fit in fits]) - true
+    in_errors = away / np.array([fit.error_v for fit in fits])
+    assert np.ptp(true) > 0.2
+    assert np.std(away) < 0.02
+    assert np.std(in_errors) == pytest.approx(1.0, abs=0.15)
+    assert abs(in_errors.mean()) < 0.25
+
+
+@pytest.mark.parametrize(
+    ("shift", "refusal"),
+    [
+        (lambda bias: -5.0 + 0.0 * bias, "no maximum"),
+        (lambda bias: 3.0 * bias**2, "no maximum"),
+        (lambda bias: -(bias**2) - 2.0 * bias**3, "skew"),
+        (lambda bias: -((bias - 1.5) ** 2), "outside the sweep"),
+        (lambda bias: np.full(len(bias), np.nan), "too few points"),
+    ],
+)
+def test_frequency_shift_that_is_no_parabola_is_refused(
+    shift: Callable[[np.ndarray], np.ndarray], refusal: str
+) -> None:
+    bias = np.linspace(-1.0, 1.0, 50)
+    noise = 1e-3 * np.random.default_rng(1).standard_normal(50)
+    values = np.stack([bias, shift(bias) + noise], 1)
+    curve = Spectrum((0.0, 0.0), "IV", ("Bias", "Frequency Shift"), ("V", "Hz"), values)
+    with pytest.raises(InvalidValue, match=refusal):
+        evaluation("contact_potential").of(curve)
+
+
+def test_curve_without_frequency_shift_has_no_contact_potential() -> None:
+    plain = World.from_settings({"surface": "flat", "feedback": {"mode": "current"}}, 3, 0.0)
+    with pytest.raises(InvalidValue, match="no 'frequency shift'"):
+        evaluation("contact_potential").of(spectrum_at(plain, "IV", 0.0))
 
 
 def test_adhesion_of_a_curve_is_proportional_to_the_one_of_the_map() -> None:
@@ -200,7 +274,7 @@ def test_adhesion_of_a_curve_is_proportional_to_the_one_of_the_map() -> None:
     places = np.linspace(-5e-7, 5e-7, 12)
     found = np.array([adhesion_n(spectrum_at(world, "force", x)) for x in places])
     ratio = found / world.property_map.at(places, 0.0)
-    assert ratio == pytest.approx(ratio[0], rel=0.05)
+    assert ratio == pytest.approx(np.mean(ratio), rel=0.07)
 
 
 def test_a_curve_without_the_quantity_is_refused() -> None:

@@ -67,7 +67,7 @@ def test_noise_and_saturation_of_the_amplifier() -> None:
 def test_pulling_off_takes_the_adhesion_of_the_radius() -> None:
     for radius in (10e-9, 40e-9):
         curve = force(1.0, TipShape(radius, 18.0), range_m=400e-9)
-        assert curve[:, 4].min() == pytest.approx(-4 * math.pi * radius * 0.03, rel=0.03)
+        assert curve[:, 4].min() == pytest.approx(-2 * math.pi * radius * 0.03, rel=0.03)
 
 
 def test_approach_and_retract_differ_by_the_jumps() -> None:

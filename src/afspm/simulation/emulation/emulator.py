@@ -95,8 +95,8 @@ class Emulator(ABC):
         faults: each a text as on the command line (`KIND[@SECONDS][,count=N][,duration=SECONDS]`) or a table of
             `kind`, `at_s`, `count`, `duration_s`.
         surface: a kind of sample, or a table of `kind` and its settings.
-        tip, tip_changes, drift, feedback, scanner, noise, signals, iv, force, property_map: settings of the simulated
-            world, as in `World.from_settings`. The scanner may be a name: "stm-4k".
+        tip, tip_changes, drift, feedback, scanner, noise, signals, iv, force, z, property_map: settings of the
+            simulated world, as in `World.from_settings`. The scanner may be a name: "stm-4k".
 
     Attributes:
         clock, log: of the experiment; set before `open`, like all following attributes.
@@ -159,6 +159,7 @@ class Emulator(ABC):
         signals: PlainMapping | None = None,
         iv: PlainMapping | None = None,
         force: PlainMapping | None = None,
+        z: PlainMapping | None = None,
         property_map: PlainMapping | None = None,
     ) -> None:
         self.port = port
@@ -176,6 +177,7 @@ class Emulator(ABC):
             "signals": signals,
             "iv": iv,
             "force": force,
+            "z": z,
             "property_map": property_map,
         }
         self._world_settings = {name: settings for name, settings in world.items() if settings is not None}

@@ -24,6 +24,7 @@ from afspm.simulation.feedback import FeedbackSettings
 from afspm.simulation.instrument import SimulatedInstrument
 from afspm.simulation.settings import build
 from afspm.simulation.simulator.controller import PanelEvent, SimulatedController
+from afspm.simulation.spectra import KINDS
 from afspm.simulation.truth import Truth
 from afspm.simulation.world import read_settings
 from afspm.storage.formats import read
@@ -95,13 +96,14 @@ def _controller_action(
     return act
 
 
+_BOTH_WAYS: Final = ("Current", "Deflection", "Force", "Frequency Shift")
 _VARIABLES: Final = VariableRoles.declared(
     {
         "bias": ["Bias"],
         "height": ["Z"],
         "conductance": ["dI/dV"],
-        **{name.lower(): [name] for name in ("Current", "Deflection", "Force")},
-        **{f"{name.lower()}, retrace": [f"{name} Retrace"] for name in ("Current", "Deflection", "Force")},
+        **{name.lower(): [name] for name in _BOTH_WAYS},
+        **{f"{name.lower()}, retrace": [f"{name} Retrace"] for name in _BOTH_WAYS},
     }
 )
 
@@ -113,7 +115,7 @@ class Simulator(Driver):
         seed: seed of all random numbers.
         surface: a kind, or a table of `kind` and its settings.
         scanner: a table of settings, or the name of a scanner with the statistics of a real one: "stm-4k".
-        tip, tip_changes, drift, feedback, noise, signals, iv, force, property_map: a table of settings.
+        tip, tip_changes, drift, feedback, noise, signals, iv, force, z, property_map: a table of settings.
         initial: values of parameters at the start, by their generic names.
         approach_s: duration of engaging and retracting.
         faults: faults and their times, each a table of `kind` (`FAULT_KINDS`), `at_s`, `count`, `duration_s`.
@@ -157,6 +159,7 @@ class Simulator(Driver):
         signals: Table | None = None,
         iv: Table | None = None,
         force: Table | None = None,
+        z: Table | None = None,
         property_map: Table | None = None,
         initial: Table | None = None,
         approach_s: Duration = 1.0,
@@ -182,6 +185,7 @@ class Simulator(Driver):
             "signals": signals,
             "iv": iv,
             "force": force,
+            "z": z,
             "property_map": property_map,
         }
         self._world_settings = {name: settings for name, settings in world.items() if settings is not None}
@@ -248,7 +252,7 @@ class Simulator(Driver):
         names = {"height": ["Height"], "height, retrace": ["Height Retrace"], "current": ["Current"]}
         if loop is not None and loop.mode == "amplitude":
             names |= {"amplitude": ["Amplitude"], "phase": ["Phase"]}
-        if loop is not None and (loop.mode == "frequency-shift" or (loop.mode == "current" and loop.qplus)):
+        if loop is not None and loop.senses_shift:
             names |= {"frequency shift": ["Frequency Shift"]}
         return ChannelRoles.declared(names, _VARIABLES)
 
@@ -402,7 +406,7 @@ def _import_writer() -> None:
 
 
 def _rows_for(mode: str) -> Rows:
-    return {names.ZCTRL_SETPOINT: _SETPOINTS[mode], names.SPEC_KIND: {"choices": ["IV", "force"]}}
+    return {names.ZCTRL_SETPOINT: _SETPOINTS[mode], names.SPEC_KIND: {"choices": list(KINDS)}}
 
 
 def _merged(*tables: Mapping[str, Mapping[str, object]]) -> Rows:

@@ -24,7 +24,7 @@ from afspm.simulation.faults import Faults
 from afspm.simulation.instrument import InstrumentBusy, SimulatedInstrument
 from afspm.storage.atomic import write_atomic
 from afspm.translator.own_files import FileFacts, encode_scan
-from afspm.translator.parameters import ParameterTable, Value
+from afspm.translator.parameters import FEEDBACK_ON, ParameterTable, Value
 from afspm.translator.setting_groups import feedback, frame
 from afspm.translator.state import Kept
 
@@ -173,6 +173,9 @@ class SimulatedController:
         before = self._si()
         self._kept["values"].update(values)
         after = self._si()
+        # before the rest, so that setpoint and bias are remembered with which the feedback has held z
+        if after.get(FEEDBACK_ON) is False:
+            self.instrument.switch_feedback(now_s, on=False)
         self._put_in_force()
         self.instrument.note_changes(now_s)
         rate_m_s = (float(after[names.DRIFT_RATE_X]), float(after[names.DRIFT_RATE_Y]))

@@ -53,10 +53,12 @@ class ZController:
         rig = self._core.rig
         self.state = "on" if on else "off"
         self._follows_s = now_s + (0.0 if on else off_delay_s)
-        if not on and rig.setup.feedback.on and rig.engaged and self._scans.running is None:
-            lift_m = (*self._core.registers.get("ZCtrl.TipLift"), 0.0)[0]
-            rig.hold(float(np.mean([self._signals.z_m(now_s) for _ in range(_Z_AVERAGED)])) + lift_m)
+        lift_m = (*self._core.registers.get("ZCtrl.TipLift"), 0.0)[0]
+        lifts = not on and rig.setup.feedback.on and rig.engaged and self._scans.running is None
+        z_m = float(np.mean([self._signals.z_m(now_s) for _ in range(_Z_AVERAGED)])) if lifts and lift_m else 0.0
         rig.switch_feedback(now_s, on=on)
+        if z_m:
+            rig.hold(z_m + lift_m)
         if on:
             rig.engaged = True
 

@@ -381,6 +381,8 @@ class SmartScanProgram(MakerProgram):
     def _apply(self) -> None:
         setup = self.rig.setup
         gain = self._values[_GAIN]
+        if not self._values[_ENABLE]:
+            self.rig.switch_feedback(self.now_s, on=False)
         setup.feedback = replace(
             setup.feedback,
             setpoint=self._values[_SETPOINT],
