@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from afspm.simulation.emulation.tcp_server import ClientConnection, TcpServer
     from afspm.simulation.faults import Faults
     from afspm.simulation.instrument import InstrumentBusy, SimulatedInstrument
+    from afspm.simulation.spectra import SweptCurve
     from afspm.simulation.world import World
 
 if TYPE_CHECKING:  # one emulated controller has it today, and another's may
@@ -62,6 +63,7 @@ __all__ = [
     "SimulatedInstrument",
     "Simulator",
     "SpectrumActivity",
+    "SweptCurve",
     "TcpServer",
     "Unfinished",
     "World",
@@ -85,6 +87,7 @@ if not TYPE_CHECKING:
             "afspm.simulation.ledger": "LEDGER_EVENT",
             "afspm.simulation.scanning": "MOST_PIXELS",
             "afspm.simulation.simulator": "Simulator",
+            "afspm.simulation.spectra": "SweptCurve",
             "afspm.simulation.world": "World",
         },
     )

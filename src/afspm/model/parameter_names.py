@@ -101,8 +101,8 @@ OF_CURVES: Final = {
     LOCK_IN_FREQUENCY: "Hz",
 }
 """The parameters of curves with their SI units."""
-SWEEPS_BIAS: Final = frozenset({"IV", "dI/dV", "df(V)"})
-SWEEPS_HEIGHT: Final = frozenset({"force", "I(z)", "df(z)"})
+SWEEPS_BIAS: Final = frozenset({"IV"})
+SWEEPS_HEIGHT: Final = frozenset({"force", "z"})
 """Kinds of curves by the swept quantity; others, such as a maker's vector programs, may sweep any."""
 
 FEEDBACK_ON: Final = "x-feedback-on"

@@ -43,6 +43,7 @@ from afspm.simulation.feedback import FeedbackSettings
 from afspm.simulation.ledger import DamageCounter, DamageLedger, Note, ScannedPlace
 from afspm.simulation.measuring import Adjustment
 from afspm.simulation.scan_drawing import FARTHEST_M, RunWork, ScanDrawing, run_at_once
+from afspm.simulation.spectra import AS_SET, SweptCurve
 from afspm.simulation.world import World
 
 Doing = ScanActivity | SpectrumActivity | Occupied
@@ -320,7 +321,7 @@ class SimulatedInstrument:
 
     # -- spectra
 
-    def start_spectrum(self, kind: str, now_s: float, sweeps: int = 1) -> SpectrumActivity:
+    def start_spectrum(self, kind: str, now_s: float, sweeps: int = 1, curve: SweptCurve = AS_SET) -> SpectrumActivity:
         """Start a curve of a kind ("IV", "force") at the probe's position, the mean of `sweeps` (at most 32 computed).
 
         Raises:
@@ -328,7 +329,7 @@ class SimulatedInstrument:
         """
         self._check_free(now_s)
         taken = [
-            self.world.spectrum(kind, self._probe_m, now_s, self.setup.feedback, self.setup.bias_v)
+            self.world.spectrum(kind, self._probe_m, now_s, self.setup.feedback, self.setup.bias_v, curve)
             for _ in range(max(1, min(sweeps, _MOST_AVERAGED)))
         ]
         names, units, _ = taken[0]
@@ -338,7 +339,7 @@ class SimulatedInstrument:
             random = np.random.default_rng((self.seed, 2, number))
             for column, unit in list(enumerate(units))[1:]:  # the first column is the sweep
                 values[:, column] = noise_in_air(random, values.shape[:1], unit)
-        end_s = now_s + sweeps * self.world.spectrum_s(kind)
+        end_s = now_s + sweeps * self.world.spectrum_s(kind, curve)
         self.spectrum = SpectrumActivity(number, kind, self._probe_m, now_s, end_s, names, units, values)
         self._doing = self._measured = self.spectrum
         if self.engaged:

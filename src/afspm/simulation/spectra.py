@@ -23,6 +23,33 @@ _PHASES = 64  # of the modulation, at which the lock-in amplifier is computed
 
 
 @dataclass(frozen=True)
+class SweptCurve:
+    """What a request says of one curve; None: as the settings of its kind.
+
+    Attributes:
+        ends: first and last bias in V, or height in m relative to z at the start, positive away from the sample.
+        point_s: time to measure each point, each way.
+        z_offset_m: height at which the bias is swept.
+        modulation_v: peak amplitude of the lock-in amplifier's modulation.
+    """
+
+    ends: tuple[float, float] | None = None
+    points: int | None = None
+    point_s: float | None = None
+    z_offset_m: float = 0.0
+    modulation_v: float | None = None
+
+    def duration_s(self, points: int, usual_s: float) -> float:
+        """Return the duration of both ways, by the settings of a kind."""
+        points = self.points or points
+        return usual_s if self.point_s is None else 2.0 * points * self.point_s
+
+
+AS_SET = SweptCurve()
+"""A curve by the settings of its kind."""
+
+
+@dataclass(frozen=True)
 class IVSettings:
     """Sweep and sample of current-voltage curves.
 
@@ -118,6 +145,7 @@ def current_voltage(
     loop: Loop,
     random: np.random.Generator,
     gap_m: float = 0.0,
+    ends_v: tuple[float, float] | None = None,
 ) -> Curves:
     """Return I(V), forward and backward, and dI/dV as a lock-in amplifier measures it during the forward sweep.
 
@@ -127,10 +155,12 @@ def current_voltage(
     Args:
         bias_v: bias at which the feedback held the setpoint.
         gap_m: z minus the height at which the setpoint is reached.
+        ends_v: first and last bias; None: from -range_v to range_v.
     """
-    bias = np.linspace(-settings.range_v, settings.range_v, settings.points)
+    first_v, last_v = ends_v or (-settings.range_v, settings.range_v)
+    bias = np.linspace(first_v, last_v, settings.points)
     kt_ev = _BOLTZMANN_EV_PER_K * settings.temperature_k
-    beyond = settings.range_v + settings.modulation_v + _TAILS * kt_ev
+    beyond = max(abs(first_v), abs(last_v), abs(bias_v)) + settings.modulation_v + _TAILS * kt_ev
     finest = min(kt_ev, settings.modulation_v) / 4.0
     energy = np.linspace(-beyond, beyond, min(20_001, max(1201, 2 * math.ceil(beyond / finest) + 1)))
     density = _sample_density(settings, energy, material) * _tip_density(tip, energy)
@@ -200,10 +230,14 @@ def lock_in_s(
 
 
 def over_z(
-    settings: ZSettings, current_a: Callable[[Array], Array], noise_a: float, random: np.random.Generator
+    settings: ZSettings,
+    current_a: Callable[[Array], Array],
+    noise_a: float,
+    random: np.random.Generator,
+    ends_m: tuple[float, float] | None = None,
 ) -> Curves:
     """Return the current against z, relative to z at the start, both ways; `current_a` is without its noise."""
-    z = np.linspace(settings.nearest_m, settings.farthest_m, settings.points)
+    z = np.linspace(*(ends_m or (settings.nearest_m, settings.farthest_m)), settings.points)
     there, back = (current_a(z) + noise_a * random.standard_normal(settings.points) for _ in range(2))
     return ("Z", "Current", "Current Retrace"), ("m", "A", "A"), np.stack([z, there, back], 1)
 
@@ -216,12 +250,21 @@ def with_shift(curves: Curves, shift_hz: Array, noise_hz: float, random: np.rand
     return (*names, *added), (*units, "Hz", "Hz"), np.column_stack([values, *both])
 
 
-def force_distance(settings: ForceSettings, tip: TipShape, material: float, random: np.random.Generator) -> Curves:
+def force_distance(
+    settings: ForceSettings,
+    tip: TipShape,
+    material: float,
+    random: np.random.Generator,
+    nearest_m: float = -math.inf,
+) -> Curves:
     """Return deflection and force against z, approach and retract; z is 0 where the unbent cantilever touches.
 
     The contact follows Derjaguin, Muller and Toporov (1975): the pull-off force is 2 pi R w for a work of adhesion w.
     Before contact, van der Waals attraction acts. Quasi-static: the
     cantilever follows a branch until its end, then jumps (snap-in, pull-off), so both directions differ.
+
+    Args:
+        nearest_m: the lowest z, where the approach reverses even below the trigger.
     """
     modulus = _mix(settings.modulus_pa, material, logarithmic=True)
     adhesion = _mix(settings.adhesion_j_per_m2, material) * (1.4 if tip.debris_m else 1.0)
@@ -236,6 +279,7 @@ def force_distance(settings: ForceSettings, tip: TipShape, material: float, rand
     force_in = _force_n(distance, radius, modulus, settings.approach_share * pull_off, settings.hamaker_j)
     force_out = _force_n(distance, radius, modulus, pull_off, settings.hamaker_j)
     turn = float(np.interp(-settings.trigger_n, -force_in[:1500], (distance - force_in / spring)[:1500]))
+    turn = max(turn, nearest_m)
     z = np.linspace(turn, settings.range_m, settings.points)
     there = _followed(z, distance, force_in, spring, approaching=True)
     back = _followed(z, distance, force_out, spring, approaching=False)

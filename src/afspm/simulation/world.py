@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -107,6 +108,10 @@ class WorldSettings:
     force: spectra.ForceSettings = field(default_factory=spectra.ForceSettings)
     z: spectra.ZSettings = field(default_factory=spectra.ZSettings)
     property_map: PropertyMapSettings = field(default_factory=PropertyMapSettings)
+
+    def of_curves(self, kind: str) -> spectra.IVSettings | spectra.ZSettings | spectra.ForceSettings:
+        """Return the settings of a kind of curve."""
+        return self.iv if kind == "IV" else self.z if kind == "z" else self.force
 
 
 def read_settings(settings: Mapping[str, object]) -> tuple[object, WorldSettings]:
@@ -356,6 +361,7 @@ class World:
         t_s: float,
         feedback: Feedback | None = None,
         bias_v: float = 0.1,
+        curve: spectra.SweptCurve = spectra.AS_SET,
     ) -> spectra.Curves:
         """Return a curve at a position: (names, units, values [n_points, n_variables]).
 
@@ -376,24 +382,33 @@ class World:
         relief = self.sample.relief(np.array([[x]]), np.array([[y]]), 0.0, t_s)
         material = float(relief.material[0, 0])
         random = chance.generator(self.seed, 3, call)
+        points: dict[str, Any] = {} if curve.points is None else {"points": curve.points}
         if kind == "force":
-            force = self.property_map.on_force(self.settings.force, x, y)
-            return spectra.force_distance(force, tip, material, random)
+            force = replace(self.property_map.on_force(self.settings.force, x, y), **points)
+            if curve.ends is None:
+                return spectra.force_distance(force, tip, material, random)
+            force = replace(force, range_m=max(curve.ends))
+            return spectra.force_distance(force, tip, material, random, min(curve.ends))
         setup = self._setup(loop, bias_v, (0.0, 0.0), t_s)
         loop, set_bias_v = setup.loop, bias_v if setup.set_bias_v is None else setup.set_bias_v
         gap_m = self._gap_m(position_m, t_s, setup)
         signals, noise, s = self.settings.signals, self.settings.noise, self.settings
         if kind == "IV":
+            gap_m += curve.z_offset_m
             iv, material = self.property_map.on_iv(s.iv, material, x, y)
-            curves = spectra.current_voltage(iv, tip, material, set_bias_v, loop, random, gap_m)
+            modulation_v = iv.modulation_v if curve.modulation_v is None else curve.modulation_v
+            duration_s = curve.duration_s(iv.points, iv.duration_s)
+            iv = replace(iv, modulation_v=modulation_v, duration_s=duration_s, **points)
+            curves = spectra.current_voltage(iv, tip, material, set_bias_v, loop, random, gap_m, curve.ends)
             from_set_m, swept_v = np.asarray(gap_m), curves[2][:, 0]
         else:
             of_material = np.asarray(material)
             curves = spectra.over_z(
-                s.z,
+                replace(s.z, **points),
                 lambda z: current_a(signals, loop, gap_m + z, of_material, bias_v, setup.set_bias_v),
                 noise.current_a,
                 random,
+                curve.ends,
             )
             from_set_m, swept_v = gap_m + curves[2][:, 0], np.asarray(bias_v)
         if not loop.settings.senses_shift:
@@ -424,9 +439,9 @@ class World:
         limit_a = s.iv.preamplifier_a if kind == "IV" else s.signals.preamplifier_a - 4.0 * s.noise.current_a
         return float((np.abs(current_a) >= limit_a).mean())
 
-    def spectrum_s(self, kind: str) -> float:
-        s = self.settings
-        return {"IV": s.iv.duration_s, "z": s.z.duration_s}.get(kind, s.force.duration_s)
+    def spectrum_s(self, kind: str, curve: spectra.SweptCurve = spectra.AS_SET) -> float:
+        of_kind = self.settings.of_curves(kind)
+        return curve.duration_s(of_kind.points, of_kind.duration_s)
 
     def compensate(self, velocity_m_per_s: tuple[float, float], t_s: float) -> None:
         """Set the velocity (x, y) of the scanner's own drift compensation from `t_s` on.

@@ -22,6 +22,7 @@ from afspm.model import ControlResponse, ScanLines, ScopeState, Spectrum, names
 from afspm.simulation.activities import Channels, ScanActivity, SpectrumActivity
 from afspm.simulation.faults import Faults
 from afspm.simulation.instrument import InstrumentBusy, SimulatedInstrument
+from afspm.simulation.simulator import curves
 from afspm.storage.atomic import write_atomic
 from afspm.translator.own_files import FileFacts, encode_scan
 from afspm.translator.parameters import FEEDBACK_ON, ParameterTable, Value
@@ -86,6 +87,7 @@ class SimulatedController:
         self._files = SavedFiles(folder, kept, faults)
         self._log = log
         self._panel = sorted(panel, key=lambda event: event.at_s)
+        kept["values"] = {**self._curves_at_first(kept["values"].get(names.SPEC_KIND, "IV")), **kept["values"]}
         self._put_in_force()
         if "instrument" in kept:
             instrument.restore(kept["instrument"])
@@ -171,6 +173,8 @@ class SimulatedController:
         """
         self.instrument.account(now_s)  # with the feedback as it was
         before = self._si()
+        if names.SPEC_KIND in values:
+            self._choose_kind(str(values[names.SPEC_KIND]))
         self._kept["values"].update(values)
         after = self._si()
         # before the rest, so that setpoint and bias are remembered with which the feedback has held z
@@ -191,6 +195,16 @@ class SimulatedController:
                 frame_m = self.instrument.setup.region.center_m if way_m > 0.0 else None
                 self.instrument.move_probe(place_m, now_s, way_m=way_m, frame_m=frame_m)
         self._keep()
+
+    def _curves_at_first(self, kind: str) -> dict[str, Value]:
+        found = curves.at_first(kind, self.instrument.world.settings)
+        return {name: self._table[name].to_vendor(value) for name, value in found.items() if name in self._table}
+
+    def _choose_kind(self, kind: str) -> None:
+        values, of_kinds = self._kept["values"], self._kept.setdefault("curves", {})
+        of_kinds[values[names.SPEC_KIND]] = {name: values[name] for name in curves.OF_KIND if name in values}
+        of_kind = of_kinds.get(kind) or self._curves_at_first(kind)
+        values.update({name: value for name, value in of_kind.items() if name in curves.OF_KIND})
 
     def _put_in_force(self) -> None:
         values, setup = self._si(), self.instrument.setup
@@ -222,7 +236,8 @@ class SimulatedController:
         self._prepare(now_s)
         if not self._faults.strikes("spectrum-refused", now_s):
             with _refusing():
-                self.instrument.start_spectrum(str(self._kept["values"][names.SPEC_KIND]), now_s)
+                kind = str(self._kept["values"][names.SPEC_KIND])
+                self.instrument.start_spectrum(kind, now_s, curve=curves.swept(kind, self._si()))
             self._measures()
 
     def stop(self, now_s: float) -> None:

@@ -85,6 +85,10 @@ class Registers:
         """Return the stored or initial values; empty if there are none."""
         return self._kept.get((register, tuple(belongs_to)), AT_FIRST.get(register, ()))
 
+    def changed(self, register: str, *belongs_to: object) -> Values | None:
+        """Return the values that a client has set; None as long as they are the initial ones."""
+        return self._kept.get((register, belongs_to))
+
     def got(self, name: str, arguments: Sequence[object]) -> Values:
         """Return the results of a function `…Get`, one for each field; fields without a value are zero or empty."""
         kept = self.get(_OTHER_NAMES.get(name, name.removesuffix("Get")), arguments)

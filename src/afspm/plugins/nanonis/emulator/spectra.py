@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from afspm.emulation import SpectrumActivity
+from afspm.basics import ConfigError
+from afspm.emulation import SpectrumActivity, SweptCurve
 from afspm.plugins.nanonis.emulator import files
 from afspm.plugins.nanonis.emulator.core import NanonisCore
 from afspm.plugins.nanonis.emulator.dispatch import Answer, DeferredResult, FunctionRefused, Results, answers, chosen
@@ -28,8 +30,7 @@ class SweepSettings:
 
     Attributes:
         points: number of points; None: as in the simulated spectrum.
-        limits: first and last value of the sweep; None: the limits of the simulated spectrum. Beyond the limits of
-            the simulated spectrum, its outermost values continue.
+        limits: first and last bias; None: as in the simulated spectrum.
         sweeps: number of averaged sweeps.
         channels: indexes of recorded signals; None: all signals of the simulated spectrum.
         backward: True if the spectrum is also swept backwards.
@@ -46,20 +47,12 @@ class SweepSettings:
     saves_all: bool = False
     dialog: bool = False
 
-    def resample(self, curve: SpectrumActivity) -> SpectrumActivity:
-        """Return the spectrum resampled to this sweep."""
-        values = curve.values
-        if self.points is not None or self.limits is not None:
-            swept = values[:, 0]
-            first, last = self.limits or (swept[0], swept[-1])
-            asked = np.linspace(first, last, self.points or len(swept))
-            ascending = values[np.argsort(swept)]
-            columns = (np.interp(asked, ascending[:, 0], column) for column in ascending.T[1:])
-            values = np.stack([asked, *columns], axis=1)
+    def kept(self, curve: SpectrumActivity) -> SpectrumActivity:
+        """Return the spectrum without the way back unless it is swept, too."""
         kept = [k for k, name in enumerate(curve.names) if self.backward or not name.endswith(" Retrace")]
         return replace(
             curve,
-            values=values[:, kept],
+            values=curve.values[:, kept],
             names=tuple(curve.names[k] for k in kept),
             units=tuple(curve.units[k] for k in kept),
         )
@@ -99,8 +92,24 @@ class SpectroscopyModules:
         """Start a spectrum. Raises InstrumentBusy; InvalidValue: `base_name` can't be part of a file's name."""
         self._base_names[module] = checked_name(base_name) or self._base_names[module]
         sweep = self.sweeps[module]
-        curve = sweep.resample(self._core.rig.start_spectrum(_KINDS[module], self._core.now_s, sweep.sweeps))
+        swept = self._swept(module, sweep)
+        try:
+            curve = self._core.rig.start_spectrum(_KINDS[module], self._core.now_s, sweep.sweeps, swept)
+        except ConfigError as error:  # values beyond any instrument
+            raise FunctionRefused(str(error)) from error
+        curve = sweep.kept(curve)
         self.running = curve if sweep.channels is None else self._recorded(curve, sweep.channels)
+
+    def _swept(self, module: str, sweep: SweepSettings) -> SweptCurve:
+        # what no client has set is as in the simulated spectrum
+        changed = self._core.registers.changed
+        timing, z_range, modulation = changed(f"{module}.Timing"), changed("ZSpectr.Range"), changed("LockIn.ModAmp", 1)
+        point_s = sum(timing[4:6] if module == "BiasSpectr" else timing[3:5]) if timing else None
+        if module == "ZSpectr":
+            ends = None if z_range is None else (z_range[0], z_range[0] + z_range[1])
+            return SweptCurve(ends, sweep.points, point_s)
+        z_offset_m = timing[1] if timing else 0.0
+        return SweptCurve(sweep.limits, sweep.points, point_s, z_offset_m, modulation[0] if modulation else None)
 
     def _recorded(self, curve: SpectrumActivity, channels: list[int]) -> SpectrumActivity:
         # A recorded channel that the simulated spectrum lacks is constant.
@@ -188,6 +197,9 @@ class SpectroscopyModules:
     def _set_bias_properties(
         self, save_all: int, sweeps: int, backward: int, points: int, z_off_m: float, autosave: int, dialog: int
     ) -> Answer:
+        timing = self._core.registers.get("BiasSpectr.Timing")
+        if not math.isnan(z_off_m) and z_off_m != timing[1]:  # also an entry of TimingSet
+            self._core.registers.put("BiasSpectr.Timing", timing[0], z_off_m, *timing[2:])
         return self._set_properties("BiasSpectr", points, sweeps, (backward, autosave, save_all, dialog))
 
     @answers("ZSpectr.PropsSet")
