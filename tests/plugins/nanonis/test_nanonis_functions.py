@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
 from collections.abc import Callable
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,7 @@ from tests.plugins.vendor_bench import ready
 from afspm.basics import ConfigError, InvalidValue
 from afspm.experiment import load
 from afspm.model import ControlRequest, ControlResponse, Parameter, Request, ScopeState, names
+from afspm.plugins import nanonis
 from afspm.plugins.nanonis import Nanonis
 from afspm.plugins.nanonis.experiment_functions import FunctionCall, ValueFunctions
 from afspm.scheduler.safety import forbidden_states
@@ -171,6 +175,7 @@ def test_sweep_of_a_signal_chosen_in_nanonis_needs_a_word_on_the_tip(tmp_path: P
         ({"vendor": "BiasSpectr.Limits #2"}, "sets tip-bias-voltage"),
         ({"vendor": "ZCtrl.OnOff", "type": "bool"}, "write set = { x-feedback-on = … }"),
         ({"vendor": "AutoApproach.OnOff", "type": "int"}, "it brings the tip to the sample"),
+        ({"vendor": "KelvinCtrl.CtrlOnOff", "type": "bool"}, "use it in an action"),
     ],
 )
 def test_parameter_is_checked_before_a_run(row: dict[str, Any], what: str) -> None:
@@ -180,7 +185,24 @@ def test_parameter_is_checked_before_a_run(row: dict[str, Any], what: str) -> No
     assert caught.value.where == "the experiment file, parameters.x-own"
 
 
-def test_all_getters_of_one_number_can_be_parameters_unless_a_key_is_missing() -> None:
+def test_recipes_of_the_readme_are_accepted() -> None:
+    page = Path(str(resources.files(nanonis) / "README.md")).read_text(encoding="utf-8")
+    blocks = [
+        tomllib.loads(block)["microscope"] for block in re.findall(r"^```toml\n(.*?)^```", page, re.DOTALL | re.M)
+    ]
+    actions = {name: action for block in blocks for name, action in block.get("actions", {}).items()}
+    rows = {name: row for block in blocks for name, row in block.get("parameters", {}).items() if name[:2] == "x-"}
+    assert len(actions) > 7
+    assert len(rows) > 5
+    table = Nanonis.parameter_table(rows)
+    assert Nanonis.values_commanded(actions.pop("x-narrow-sweep"), table) == [
+        (names.TIP_BIAS_VOLTAGE, -0.3),
+        (names.TIP_BIAS_VOLTAGE, 0.3),
+    ]
+    assert all(Nanonis.values_commanded(action, table) == [] for action in actions.values())
+
+
+def test_key_of_a_parameter_and_texts_of_a_command_are_read() -> None:
     with pytest.raises(InvalidValue):
         ValueFunctions.of("PLL.FreqShift")
     assert ValueFunctions.of("PLL.FreqShift 1").keys == (1,)

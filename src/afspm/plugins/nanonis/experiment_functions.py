@@ -239,7 +239,8 @@ def check_row(row: ParameterSpec) -> None:
         return
     if not functions.setter:
         raise InvalidValue(f"afspm can read {row.vendor}, and not set it: write read_only = true")
-    _refuse(" ".join(map(str, (functions.setter, *functions.keys, math.inf))), _REFUSED)
+    only_actions = {_CHOSEN_IN_NANONIS: "use it in an action, with your word on the tip, `withdrawn`"}
+    _refuse(" ".join(map(str, (functions.setter, *functions.keys, math.inf))), {**_REFUSED, **only_actions})
     same = SETS.get(functions.setter, {}).get(len(functions.keys) + functions.place, row.name)
     if same != row.name:
         raise InvalidValue(f"{functions.setter} sets {same}: use that parameter, whose limits count")

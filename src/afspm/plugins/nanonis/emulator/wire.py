@@ -1,6 +1,6 @@
 """Controller's side of the TCP protocol: decoding of requests and encoding of replies.
 
-Independent of the translator's code, so that each checks the other.
+Independent of the translator's code, so that each checks the other; both read the table `functions.txt`.
 """
 
 from __future__ import annotations
