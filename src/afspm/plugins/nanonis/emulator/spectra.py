@@ -12,11 +12,11 @@ from afspm.plugins.nanonis.emulator import files
 from afspm.plugins.nanonis.emulator.core import NanonisCore
 from afspm.plugins.nanonis.emulator.dispatch import Answer, DeferredResult, FunctionRefused, Results, answers, chosen
 from afspm.plugins.nanonis.emulator.session import checked_name
-from afspm.plugins.nanonis.emulator.signals import Signals, name_and_unit, spectrum_columns, spectrum_signal
+from afspm.plugins.nanonis.emulator.signals import CHANNELS, Signals, name_and_unit, spectrum_columns, spectrum_signal
 
 _KINDS: Final = {"BiasSpectr": "IV", "ZSpectr": "force"}
 _CHANNELS: Final = {"BiasSpectr": (0, 22), "ZSpectr": (20, 21)}
-"""Indexes of the signals in simulated spectra."""
+"""Indexes of the signals in simulated spectra; bias spectra of a sensor have its frequency shift as well."""
 _TITLES: Final = {"BiasSpectr": "bias spectroscopy", "ZSpectr": "Z spectroscopy"}
 _FILE_NAMES: Final = {"BiasSpectr": "Bias-Spectroscopy", "ZSpectr": "Z-Spectroscopy"}
 _MOST_POINTS: Final = 1 << 16
@@ -71,6 +71,7 @@ class SpectroscopyModules:
     Attributes:
         sweeps: sweep settings by module.
         running: the running spectrum; None without a spectrum.
+        module: the module of the last spectrum.
         ended: number of ended spectra, completed or stopped.
     """
 
@@ -78,6 +79,7 @@ class SpectroscopyModules:
         self._core, self._signals = core, signals
         self.sweeps = {module: SweepSettings() for module in _KINDS}
         self.running: SpectrumActivity | None = None
+        self.module = "BiasSpectr"
         self.ended = 0
         self._stopped: tuple[SpectrumActivity | None, float] = (None, 0.0)
         self._base_names = dict(_FILE_NAMES)
@@ -89,7 +91,7 @@ class SpectroscopyModules:
             return
         self.running = None
         self.ended += 1
-        module = next(name for name, kind in _KINDS.items() if kind == curve.kind)
+        module = self.module
         if self.sweeps[module].saves and not self._core.faults.lasts("autosave-off", now_s):
             content = files.dat(self._header(module, curve, now_s), spectrum_columns(curve), curve.values)
             session = self._core.session
@@ -99,8 +101,15 @@ class SpectroscopyModules:
         """Start a spectrum. Raises InstrumentBusy; InvalidValue: `base_name` can't be part of a file's name."""
         self._base_names[module] = checked_name(base_name) or self._base_names[module]
         sweep = self.sweeps[module]
-        curve = sweep.resample(self._core.rig.start_spectrum(_KINDS[module], self._core.now_s, sweep.sweeps))
+        curve = sweep.resample(self._core.rig.start_spectrum(self._kind(module), self._core.now_s, sweep.sweeps))
+        self.module = module
         self.running = curve if sweep.channels is None else self._recorded(curve, sweep.channels)
+
+    def _kind(self, module: str) -> str:
+        # A sweep of z that records neither deflection nor force is for current and frequency shift, near the setpoint.
+        channels = self.sweeps[module].channels
+        presses = channels is None or not set(channels).isdisjoint(_CHANNELS["ZSpectr"])
+        return "z" if module == "ZSpectr" and not presses else _KINDS[module]
 
     def _recorded(self, curve: SpectrumActivity, channels: list[int]) -> SpectrumActivity:
         # A recorded channel that the simulated spectrum lacks is constant.
@@ -147,8 +156,8 @@ class SpectroscopyModules:
 
     @answers("BiasSpectr.StatusGet", "ZSpectr.StatusGet")
     def _status(self, name: str) -> Answer:
-        kind, curve = _KINDS[self._module(name)], self.running
-        return (int(curve is not None and curve.kind == kind and curve.running(self._core.now_s)),)
+        module, curve = self._module(name), self.running
+        return (int(curve is not None and self.module == module and curve.running(self._core.now_s)),)
 
     @answers("BiasSpectr.Start", "ZSpectr.Start")
     def _start(self, name: str, get_data: int, base_name: str) -> Answer:
@@ -244,7 +253,10 @@ class SpectroscopyModules:
 
     def _channels(self, module: str) -> list[int]:
         recorded = self.sweeps[module].channels
-        return list(_CHANNELS[module]) if recorded is None else recorded
+        if recorded is not None:
+            return recorded
+        senses_shift = module == "BiasSpectr" and self._core.measures_frequency_shift
+        return [*_CHANNELS[module], *([CHANNELS["Frequency Shift"]] if senses_shift else [])]
 
     def _channel_names(self, module: str) -> list[str]:
         return [self._signals.names[index] for index in self._channels(module)]
