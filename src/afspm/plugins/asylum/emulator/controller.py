@@ -94,6 +94,7 @@ class AsylumController:
         values.put("AmplitudeSetpointMeters", metres_per_volt * values.get("AmplitudeSetpointVolts"))
         values.put("SpringConstant", force.spring_n_per_m)
         values.put("DeflectionSetpointVolts", force.trigger_n / (force.spring_n_per_m * metres_per_volt))
+        values.put("ForceDist", force.range_m + force.trigger_n / force.spring_n_per_m)
         values.put("Velocity", 2.0 * values.get("ForceDist") / force.duration_s)
         self._curve_m = values.get("ForceDist")
         fast, slow = values.size()

@@ -16,7 +16,7 @@ NUMBERS: Final[dict[str, float]] = {
     "LastScan": 0, "LastScanWithdraw": 0, "BaseSuffix": 0, "SaveImage": 2, "SaveForce": 2, "ParmChange": 0,
     "ScanStatus": 0, "FMapStatus": 0, "DelayUpdate": 0, "TipVoltage": 0.0, "SurfaceVoltage": 0.0, "NapMode": 0,
     "ImagingMode": 1, "ForceSpotNumber": 0, "XScanDirection": 1, "YScanDirection": 1, "Setpoint": 0.0008,
-    "ForceDist": 5e-7, "Velocity": 1e-6,
+    "ForceDist": 1.6e-7, "Velocity": 1.6e-7,
 }  # fmt: skip
 
 
