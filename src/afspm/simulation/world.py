@@ -88,7 +88,7 @@ SCANNERS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
         },
         "drift": {"speed_m_per_s": 15e-12, "velocity_m_per_s": (0.0, 0.0, 1e-12)},
         "signals": {"preamplifier_a": 10.004e-9},
-        "iv": {"preamplifier_a": 10.004e-9},
+        "iv": {"preamplifier_a": 10.004e-9, "temperature_k": 4.2},
     }
 }
 

@@ -570,6 +570,34 @@ def test_force_curve_has_its_position(bench: Make) -> None:
         assert float(noted[name]) > 0.0
 
 
+# results F0: the constant in the file was 3 N/m for a lever of 0.4 N/m, and the distance had no effect
+@pytest.mark.parametrize("distance_nm", [200, 400])
+def test_force_curve_has_the_distance_and_the_trigger_that_were_set(bench: Make, distance_nm: int) -> None:
+    made = bench()
+    peer = made.start(
+        parameters={
+            "x-distance": {"vendor": "ForceDist", "unit": "m"},
+            "x-velocity": {"vendor": "Velocity", "unit": "m/s"},
+            "x-trigger": {"vendor": "DeflectionSetpointVolts", "unit": "V"},
+        }
+    )
+    ready(peer)
+    for name, value in (("x-distance", distance_nm * 1e-9), ("x-velocity", 1e-6), ("x-trigger", 0.5)):
+        assert peer.set(name, str(value)).ok
+    assert peer.act(names.START_SPEC).ok
+    (curve,) = [one for one in peer.until(FREE) if isinstance(one, Spectrum)]
+    note = str(binarywave.load(curve.filename)["wave"]["note"], "latin-1")
+    noted = dict(line.split(": ", 1) for line in note.split("\r") if ": " in line)
+    assert np.ptp(curve["ZSnsr"]) == pytest.approx(distance_nm * 1e-9, rel=1e-4)
+    assert [float(noted[name]) for name in ("ForceDist", "ApproachVelocity")] == pytest.approx(
+        [distance_nm * 1e-9, 1e-6]
+    )
+    lever = made.emulator.rig.world.settings
+    assert float(noted["SpringConstant"]) == lever.force.spring_n_per_m
+    assert float(noted["InvOLS"]) == pytest.approx(lever.feedback.sensitivity_m_per_v)
+    assert curve["Defl"].max() == pytest.approx(0.5 * float(noted["InvOLS"]), rel=0.02)
+
+
 def test_force_curve_after_a_scan_is_taken_at_the_probe_position(bench: Make) -> None:
     # A scan moves the tip away.
     made = bench(speed=20.0)

@@ -28,8 +28,11 @@ from afspm.model import (
     Spectrum,
     names,
 )
+from afspm.plugins.adaptive.quantities import kelvin_parabola
 from afspm.plugins.nanonis.emulator.scans import ScanProperties
+from afspm.plugins.nanonis.emulator.signals import CHANNELS
 from afspm.plugins.nanonis.z_controller import unit_of
+from afspm.translator.parameters import FEEDBACK_ON
 from afspm.translator.trace import FILE, TracedExchange, read_trace
 
 Make = Callable[..., Bench]
@@ -341,6 +344,59 @@ def test_spectrum_has_its_position(bench: Make, kind: str, first: str, fetch: bo
     true = made.emulator.rig.spectrum
     assert true is not None
     np.testing.assert_allclose(spectrum.values, true.values, rtol=1e-4, atol=1e-18)
+
+
+def curve_of(peer: Any, kind: str) -> Spectrum:
+    assert peer.set(names.SPEC_KIND, kind).ok
+    assert peer.act(names.START_SPEC).ok
+    (spectrum,) = (one for one in peer.until(FREE) if isinstance(one, Spectrum))
+    return spectrum
+
+
+# results 5, F12: no kind of spectrum had the frequency shift
+def test_bias_spectrum_of_a_sensor_is_a_kelvin_parabola(bench: Make) -> None:
+    made = bench(speed=20.0, property_map={"kind": "smooth", "quantity": "contact_potential"})
+    peer = made.start()
+    ready(peer)
+    spectrum = curve_of(peer, "IV")
+    assert spectrum.names[4:] == ("OC M1 Freq. Shift", "OC M1 Freq. Shift [bwd]")
+    assert spectrum.units[4:] == ("Hz", "Hz")
+    fit, rig = kelvin_parabola(spectrum), made.emulator.rig
+    true: Any = rig.world.property_truth(rig.probe_m, made.clock.now_s())["property"]
+    assert fit.error_v < 0.01
+    assert abs(fit.vertex_v - true["value"]) < 5.0 * fit.error_v
+
+
+def test_z_spectrum_of_current_and_frequency_shift_stays_near_the_setpoint(bench: Make) -> None:
+    made = bench(speed=20.0)
+    peer = made.start()
+    ready(peer)
+    channels = list(CHANNELS.values())
+    made.at_panel(
+        lambda emulator: setattr(emulator.software.spectra.sweeps["ZSpectr"], "channels", [channels[0], channels[-1]])
+    )
+    spectrum = curve_of(peer, "force")
+    assert spectrum.names == ("Z rel", "Current", "Current [bwd]", "OC M1 Freq. Shift", "OC M1 Freq. Shift [bwd]")
+    z, current, shift = (spectrum.of(role) for role in ("height", "current", "frequency shift"))
+    near = z < 0.0
+    assert np.polyfit(z[near], np.log(current[near]), 1)[0] == pytest.approx(-1.0 / 50e-12, rel=0.05)
+    assert shift[0] < shift[-1] < 0.5
+
+
+# results F1: it was the setpoint at any bias, and Δf followed the bias
+def test_current_at_a_held_z_is_proportional_to_the_bias(bench: Make) -> None:
+    made = bench(speed=20.0, noise={"current_a": 1e-15, "frequency_hz": 1e-3, "white_m": 0.0})
+    peer = made.start()
+    ready(peer)
+    assert peer.set(FEEDBACK_ON, "false").ok
+    shown = {}
+    for bias in ("100", "10", "0", "-100"):
+        assert peer.set(names.TIP_BIAS_VOLTAGE, bias, "mV").ok
+        shown[bias] = made.emulator.rig.signals(made.clock.now_s())
+    currents = {bias: signals["Current"] for bias, signals in shown.items()}
+    assert currents["10"] / currents["100"] == pytest.approx(0.1, rel=0.05)
+    assert currents["-100"] / currents["100"] == pytest.approx(-1.0, rel=0.05)
+    assert abs(currents["0"]) < 1e-4 * currents["100"]
 
 
 OF_THE_STATE = (

@@ -390,7 +390,7 @@ def drift_drawn(found: Evidence) -> str:
 
 
 _QUIET_CURVES = {
-    "iv": {"noise_a": 0.0, "relative_noise": 0.0},
+    "iv": {"noise_a": 0.0, "relative_noise": 0.0, "noise_density_a": 0.0},
     "force": {"noise_m": 0.0},
 }
 
@@ -489,11 +489,11 @@ def mapped(
 
 
 def true_adhesion_n(found: Evidence, position_m: tuple[float, float], time_s: float) -> float:
-    """Return the pull-off force of Derjaguin, Muller and Toporov, 4 pi R w."""
+    """Return the pull-off force of Derjaguin, Muller and Toporov, 2 pi R w."""
     world = found.simulated.world()
     soft, hard = world.settings.force.adhesion_j_per_m2
     material = found.simulated.material(position_m, time_s)
-    return 4.0 * math.pi * world.tip.imaging_radius_m * (soft * (1.0 - material) + hard * material)
+    return 2.0 * math.pi * world.tip.imaging_radius_m * (soft * (1.0 - material) + hard * material)
 
 
 def true_gap_ev(found: Evidence, position_m: tuple[float, float], time_s: float) -> float:

@@ -13,7 +13,7 @@ from afspm.simulation.instrument import SimulatedInstrument
 from afspm.simulation.property_map import QUANTITIES, PropertyMap, PropertyMapSettings
 
 QUIET = {
-    "iv": {"noise_a": 0.0, "relative_noise": 0.0},
+    "iv": {"noise_a": 0.0, "relative_noise": 0.0, "noise_density_a": 0.0},
     "force": {"noise_m": 0.0},
     "tip_changes": {"per_hour": 0.0},
 }

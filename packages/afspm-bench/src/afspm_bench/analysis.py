@@ -199,7 +199,7 @@ def band_gap(curves: Sequence[Spectrum]) -> tuple[float, float]:
 
 def _gap_width(curve: Spectrum) -> float:
     bias, slope = curve.values[:, 0], ndimage.gaussian_filter1d(curve.values[:, 3], 1.5)
-    level = 0.19 * float(np.median(slope[np.abs(bias) > 0.9 * np.abs(bias).max()]))
+    level = 0.1 * float(np.median(slope[np.abs(bias) > 0.9 * np.abs(bias).max()]))
     middle = int(np.argmin(ndimage.gaussian_filter1d(slope, 6)))
     low = next((i for i in range(middle, -1, -1) if slope[i] > level), 0)
     high = next((i for i in range(middle, len(bias)) if slope[i] > level), len(bias) - 1)

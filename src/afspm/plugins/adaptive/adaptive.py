@@ -42,8 +42,8 @@ class Adaptive(Component):
 
     Args:
         size: (width, height) of the region.
-        quantity: "gap" (I(V) curves, in eV), "adhesion" (force curves, in N), or a function of a spectrum as
-            "module.name".
+        quantity: "gap" (I(V) curves, in eV), "adhesion" (force curves, in N), "contact_potential" (I(V) curves with the
+            frequency shift, in V), or a function of a spectrum as "module.name".
         until: limits of the map, at least one; the first that is reached ends the map: `error`, the expected rms error
             in the unit of the quantity; `spectra`, the number of spectra; `time`, experiment time since the first
             spectrum.

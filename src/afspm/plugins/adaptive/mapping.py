@@ -256,7 +256,7 @@ def measure_map(
             print(len(progress.measured), progress.error)
 
     Args:
-        quantity: "gap", "adhesion", a function of a spectrum, or its name "module.name".
+        quantity: "gap", "adhesion", "contact_potential", a function of a spectrum, or its name "module.name".
         until: {"error": …, "spectra": …, "time": …}: the first limit that is reached ends the map.
         unit: unit of the result of your own function.
         kind: kind of the spectra; None: the kind of the quantity, or the present kind.

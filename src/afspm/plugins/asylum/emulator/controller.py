@@ -33,6 +33,8 @@ _MOST_POINTS: Final = 8192
 _PULSE_S: Final = 60.0
 _INDENTS_M: Final = 1e-6
 """Longest force curve that does not drive the tip into the sample."""
+_SHORTEST_S: Final = 1e-3
+"""Shortest force curve, at any velocity that PV accepts."""
 _REACH_M: Final = 1e-3
 """Limit of all distances: far beyond any scanner."""
 _LONGEST_NAME: Final = 17
@@ -86,10 +88,15 @@ class AsylumController:
         self._curve_running = self._engages = False
         # as after a scan whose image is still open: the first spot is in the middle of the image
         self._image = self._frame()
-        # the panel knows the detector's calibration, as after a thermal tune
-        metres_per_volt = rig.world.settings.feedback.sensitivity_m_per_v
-        values.put("AmpInvOLS", metres_per_volt)
+        # the panel knows the calibration of detector and lever, as after a thermal tune
+        metres_per_volt, force = rig.world.settings.feedback.sensitivity_m_per_v, rig.world.settings.force
+        values.put("AmpInvOLS;InvOLS", metres_per_volt)
         values.put("AmplitudeSetpointMeters", metres_per_volt * values.get("AmplitudeSetpointVolts"))
+        values.put("SpringConstant", force.spring_n_per_m)
+        values.put("DeflectionSetpointVolts", force.trigger_n / (force.spring_n_per_m * metres_per_volt))
+        values.put("ForceDist", force.range_m + force.trigger_n / force.spring_n_per_m)
+        values.put("Velocity", 2.0 * values.get("ForceDist") / force.duration_s)
+        self._curve_m = values.get("ForceDist")
         fast, slow = values.size()
         self.spots_m: list[tuple[float, float]] = [(fast / 2, slow / 2)]
         self._apply()
@@ -261,6 +268,7 @@ class AsylumController:
             return False
         try:
             self._indent(now_s)
+            self._apply_to_curves()
             self.rig.start_spectrum("force", now_s)
         except (AfspmError, ArithmeticError, ValueError) as error:
             self._log.warning("the force curve was refused: %s", error)
@@ -273,6 +281,19 @@ class AsylumController:
         if depth_m > _INDENTS_M:
             self.rig.crash(min(depth_m, _REACH_M), speed_m_s, now_s)
             self.rig.abandon(now_s)  # the curve itself takes the time, not the crash
+
+    def _apply_to_curves(self) -> None:
+        world, values = self.rig.world, self.values
+        self._curve_m = values.get("ForceDist")
+        force = world.settings.force
+        pressed_m = world.settings.feedback.sensitivity_m_per_v * values.get("DeflectionSetpointVolts")
+        force = replace(
+            force,
+            range_m=self._curve_m,
+            trigger_n=force.spring_n_per_m * pressed_m,
+            duration_s=max(_SHORTEST_S, 2.0 * self._curve_m / values.get("Velocity")),
+        )
+        world.settings = replace(world.settings, force=force)
 
     def stop_curve(self, now_s: float) -> None:
         self._curve_running = False
@@ -295,12 +316,12 @@ class AsylumController:
 
     def _curve_done(self, now_s: float) -> None:
         self._curve_running = False
-        spectrum = self.rig.spectrum
+        spectrum, distance_m = self.rig.spectrum, self._curve_m
         if spectrum is not None:
             self._save(
                 "SaveForce",
                 now_s,
-                lambda name: files.curve(name, spectrum, self.values, self._file_clock.shown_s(now_s)),
+                lambda name: files.curve(name, spectrum, distance_m, self.values, self._file_clock.shown_s(now_s)),
             )
 
     # --- files ---

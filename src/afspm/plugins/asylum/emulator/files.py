@@ -37,9 +37,17 @@ def image(name: str, scan: ScanActivity, values: IgorValues, now_s: float) -> by
     return igor_wave(name, np.stack(layers, axis=2), "m", steps, labels, _note(values, now_s), now_s)
 
 
-def curve(name: str, spectrum: SpectrumActivity, values: IgorValues, now_s: float) -> bytes:
-    """Encode the file of a force curve: approach, then retract, over time."""
-    table = dict(zip(spectrum.names, spectrum.values.T, strict=True))
+def curve(name: str, spectrum: SpectrumActivity, distance_m: float, values: IgorValues, now_s: float) -> bytes:
+    """Encode the file of a force curve: approach, then retract, over time.
+
+    Args:
+        distance_m: way of the piezo, as set at the start.
+    """
+    z = spectrum.values[:, 0]
+    # the simulated curve has this way from the contact on, beyond its indentation
+    swept = np.linspace(z[0], z[0] + distance_m, len(z))
+    resampled = [np.interp(swept, z, column) for column in spectrum.values.T]
+    table = dict(zip(spectrum.names, resampled, strict=True))
     extension = table["Z"].max() - table["Z"]
     there_and_back: Sequence[np.ndarray] = [
         np.concatenate([extension[::-1], extension]),
@@ -47,7 +55,7 @@ def curve(name: str, spectrum: SpectrumActivity, values: IgorValues, now_s: floa
     ]
     columns = np.column_stack([*there_and_back, there_and_back[0]])
     step_s = (spectrum.end_s - spectrum.start_s) / len(columns)
-    noted = _of_curve(spectrum, float(np.ptp(extension)), columns.shape[0], values)
+    noted = _of_curve(spectrum, distance_m, columns.shape[0], values)
     return igor_wave(name, columns, "m", [(step_s, "s")], ["Raw", "Defl", "ZSnsr"], _note(values, now_s, noted), now_s)
 
 

@@ -8,7 +8,7 @@ from typing import Final
 
 NUMBERS: Final[dict[str, float]] = {
     "ScanSize": 1e-6, "FastScanSize": 1e-6, "SlowScanSize": 1e-6, "ScanRate": 1.0, "XOffset": 0.0, "YOffset": 0.0,
-    "PointsLines": 128, "ScanPoints": 128, "ScanLines": 128, "ScanAngle": 0.0, "InvOLS": 1.2e-7, "SpringConstant": 3.0,
+    "PointsLines": 128, "ScanPoints": 128, "ScanLines": 128, "ScanAngle": 0.0, "InvOLS": 6e-8, "SpringConstant": 0.4,
     "AmpInvOLS": 1e-7, "FastRatio": 1.0, "SlowRatio": 1.0, "TopLine": 127, "BottomLine": 0, "ScanSpeed": 2.5e-6,
     "IntegralGain": 10.0, "ProportionalGain": 0.0, "AmplitudeSetpointVolts": 0.7, "AmplitudeSetpointMeters": 7e-8,
     "DriveAmplitude": 0.1, "DriveFrequency": 3.7407e5, "SlowScanEnabled": 1, "DeflectionSetpointVolts": 1.0,
@@ -16,7 +16,7 @@ NUMBERS: Final[dict[str, float]] = {
     "LastScan": 0, "LastScanWithdraw": 0, "BaseSuffix": 0, "SaveImage": 2, "SaveForce": 2, "ParmChange": 0,
     "ScanStatus": 0, "FMapStatus": 0, "DelayUpdate": 0, "TipVoltage": 0.0, "SurfaceVoltage": 0.0, "NapMode": 0,
     "ImagingMode": 1, "ForceSpotNumber": 0, "XScanDirection": 1, "YScanDirection": 1, "Setpoint": 0.0008,
-    "ForceDist": 5e-7, "Velocity": 1e-6,
+    "ForceDist": 1.6e-7, "Velocity": 1.6e-7,
 }  # fmt: skip
 
 

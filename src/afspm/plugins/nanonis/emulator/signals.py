@@ -207,7 +207,7 @@ def spectrum_columns(curve: SpectrumActivity) -> list[str]:
     columns: list[str] = []
     for name, unit in zip(curve.names, curve.units, strict=True):
         forward = name.removesuffix(RETRACE)
-        called = forward if columns else _SWEPT.get(forward, forward)
+        called = NAMES.get(forward, forward) if columns else _SWEPT.get(forward, forward)
         columns.append(f"{called}{'' if forward == name else ' [bwd]'} ({unit})")
     return columns
 

@@ -14,11 +14,11 @@ from afspm.plugins.nanonis.emulator import files
 from afspm.plugins.nanonis.emulator.core import NanonisCore
 from afspm.plugins.nanonis.emulator.dispatch import Answer, DeferredResult, FunctionRefused, Results, answers, chosen
 from afspm.plugins.nanonis.emulator.session import checked_name
-from afspm.plugins.nanonis.emulator.signals import Signals, name_and_unit, spectrum_columns, spectrum_signal
+from afspm.plugins.nanonis.emulator.signals import CHANNELS, Signals, name_and_unit, spectrum_columns, spectrum_signal
 
 _KINDS: Final = {"BiasSpectr": "IV", "ZSpectr": "force"}
 _CHANNELS: Final = {"BiasSpectr": (0, 22), "ZSpectr": (20, 21)}
-"""Indexes of the signals in simulated spectra."""
+"""Indexes of the signals in simulated spectra; bias spectra of a sensor have its frequency shift as well."""
 _TITLES: Final = {"BiasSpectr": "bias spectroscopy", "ZSpectr": "Z spectroscopy"}
 _FILE_NAMES: Final = {"BiasSpectr": "Bias-Spectroscopy", "ZSpectr": "Z-Spectroscopy"}
 _MOST_POINTS: Final = 1 << 16
@@ -64,6 +64,7 @@ class SpectroscopyModules:
     Attributes:
         sweeps: sweep settings by module.
         running: the running spectrum; None without a spectrum.
+        module: the module of the last spectrum.
         ended: number of ended spectra, completed or stopped.
     """
 
@@ -71,6 +72,7 @@ class SpectroscopyModules:
         self._core, self._signals = core, signals
         self.sweeps = {module: SweepSettings() for module in _KINDS}
         self.running: SpectrumActivity | None = None
+        self.module = "BiasSpectr"
         self.ended = 0
         self._stopped: tuple[SpectrumActivity | None, float] = (None, 0.0)
         self._base_names = dict(_FILE_NAMES)
@@ -82,7 +84,7 @@ class SpectroscopyModules:
             return
         self.running = None
         self.ended += 1
-        module = next(name for name, kind in _KINDS.items() if kind == curve.kind)
+        module = self.module
         if self.sweeps[module].saves and not self._core.faults.lasts("autosave-off", now_s):
             content = files.dat(self._header(module, curve, now_s), spectrum_columns(curve), curve.values)
             session = self._core.session
@@ -94,10 +96,10 @@ class SpectroscopyModules:
         sweep = self.sweeps[module]
         swept = self._swept(module, sweep)
         try:
-            curve = self._core.rig.start_spectrum(_KINDS[module], self._core.now_s, sweep.sweeps, swept)
+            curve = self._core.rig.start_spectrum(self._kind(module), self._core.now_s, sweep.sweeps, swept)
         except ConfigError as error:  # values beyond any instrument
             raise FunctionRefused(str(error)) from error
-        curve = sweep.kept(curve)
+        curve, self.module = sweep.kept(curve), module
         self.running = curve if sweep.channels is None else self._recorded(curve, sweep.channels)
 
     def _swept(self, module: str, sweep: SweepSettings) -> SweptCurve:
@@ -110,6 +112,12 @@ class SpectroscopyModules:
             return SweptCurve(ends, sweep.points, point_s)
         z_offset_m = timing[1] if timing else 0.0
         return SweptCurve(sweep.limits, sweep.points, point_s, z_offset_m, modulation[0] if modulation else None)
+
+    def _kind(self, module: str) -> str:
+        # A sweep of z that records neither deflection nor force is for current and frequency shift, near the setpoint.
+        channels = self.sweeps[module].channels
+        presses = channels is None or not set(channels).isdisjoint(_CHANNELS["ZSpectr"])
+        return "z" if module == "ZSpectr" and not presses else _KINDS[module]
 
     def _recorded(self, curve: SpectrumActivity, channels: list[int]) -> SpectrumActivity:
         # A recorded channel that the simulated spectrum lacks is constant.
@@ -156,8 +164,8 @@ class SpectroscopyModules:
 
     @answers("BiasSpectr.StatusGet", "ZSpectr.StatusGet")
     def _status(self, name: str) -> Answer:
-        kind, curve = _KINDS[self._module(name)], self.running
-        return (int(curve is not None and curve.kind == kind and curve.running(self._core.now_s)),)
+        module, curve = self._module(name), self.running
+        return (int(curve is not None and self.module == module and curve.running(self._core.now_s)),)
 
     @answers("BiasSpectr.Start", "ZSpectr.Start")
     def _start(self, name: str, get_data: int, base_name: str) -> Answer:
@@ -256,7 +264,10 @@ class SpectroscopyModules:
 
     def _channels(self, module: str) -> list[int]:
         recorded = self.sweeps[module].channels
-        return list(_CHANNELS[module]) if recorded is None else recorded
+        if recorded is not None:
+            return recorded
+        senses_shift = module == "BiasSpectr" and self._core.measures_frequency_shift
+        return [*_CHANNELS[module], *([CHANNELS["Frequency Shift"]] if senses_shift else [])]
 
     def _channel_names(self, module: str) -> list[str]:
         return [self._signals.names[index] for index in self._channels(module)]
