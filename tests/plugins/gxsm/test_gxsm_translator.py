@@ -526,6 +526,18 @@ def test_spectrum_has_its_position(bench: Make, kind: str, first: str, settings:
     np.testing.assert_allclose(spectrum.values[:, 0], true.values[:, 0], rtol=1e-6)
 
 
+@pytest.mark.parametrize("card", ["SRanger", "RPSPMC"])
+def test_curve_sweeps_the_bias_that_was_asked_for(bench: Make, card: str) -> None:
+    made = bench(speed=20.0, card=card)
+    peer = made.start()
+    ready(peer)
+    for name, value, unit in (("x-spec-from", "-250", "mV"), ("x-spec-to", "0.75", "V"), ("x-spec-points", "65", "")):
+        assert peer.set(name, value, unit).ok
+    assert peer.act(names.START_SPEC).ok
+    (spectrum,) = (one for one in peer.until(FREE) if isinstance(one, Spectrum))
+    np.testing.assert_allclose(spectrum.values[:, 0], np.linspace(-0.25, 0.75, 65), atol=1e-6)
+
+
 def test_a_spectrum_out_of_the_frame_is_refused(bench: Make) -> None:
     made = bench()
     peer = made.start()

@@ -13,7 +13,7 @@ import numpy as np
 from afspm import read
 from afspm.basics import NS_PER_S, Clock, InvalidValue, Plain
 from afspm.driver import FileContent
-from afspm.emulation import ControllerClock, Faults, ScanActivity, SimulatedInstrument, SpectrumActivity
+from afspm.emulation import ControllerClock, Faults, ScanActivity, SimulatedInstrument, SpectrumActivity, SweptCurve
 from afspm.model import Region
 from afspm.plugins.gxsm.emulator import files
 from afspm.plugins.gxsm.emulator.entries import GxsmEntries, GxsmEntry, lengths, simulated_3, subscan
@@ -255,10 +255,19 @@ class GxsmProgram:
             "dsp-adv-scan-slope-y": GxsmEntry(0.0, -0.2, 0.2, on_change=sloped(1)),
             "dsp-gvp-du00": GxsmEntry(0.0, -10.0, 10.0, "V"),
         }
+        iv = rig.world.settings.iv
+        found |= {
+            self._of_iv("Start"): GxsmEntry(-iv.range_v, -10.0, 10.0, "V"),
+            self._of_iv("End"): GxsmEntry(iv.range_v, -10.0, 10.0, "V"),
+            self._of_iv("Points"): GxsmEntry(iv.points, 2.0, 1e5, whole=True),
+        }
         if self.card == "RPSPMC":
             return {**found, "dsp-GVP-VPJR": GxsmEntry(0.0)}
         zs = {"dsp-Z-start": GxsmEntry(0.0, -1e4, 1e4), "dsp-Z-end": GxsmEntry(0.0, -1e4, 1e4)}
         return {**found, **zs, "dsp-Z-Slope": GxsmEntry(100.0, 1e-3, 1e6), "dsp-fbs-motor": GxsmEntry(0.0, -10.0, 10.0)}
+
+    def _of_iv(self, entry: str) -> str:
+        return f"dsp-IV-{entry}{'' if self.card == 'RPSPMC' else '00'}"
 
     def _bias(self, value: float) -> None:
         # A bias voltage in force for less than a second counts as a pulse on the simulated tip.
@@ -523,9 +532,15 @@ class GxsmProgram:
         if self.rig.busy(self.clock.now_s()):
             return
         try:
-            self.curve = self.rig.start_spectrum(kind, self.clock.now_s())
+            self.curve = self.rig.start_spectrum(kind, self.clock.now_s(), curve=self._swept(kind))
         except InvalidValue as error:
             self.dialogs.append(str(error))
+
+    def _swept(self, kind: str) -> SweptCurve:
+        if kind != "IV" or self.card == "simulator":
+            return SweptCurve()
+        first_v, last_v, points = (self.entries[self._of_iv(entry)] for entry in ("Start", "End", "Points"))
+        return SweptCurve((first_v, last_v), int(points))
 
     def columns(self, curve: SpectrumActivity) -> dict[str, np.ndarray]:
         """Return a spectrum's columns by GXSM's labels."""
