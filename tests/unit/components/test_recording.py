@@ -24,7 +24,7 @@ from afspm.basics.errors import FileError
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.launch import Launch
 from afspm.components import recorder, recording
-from afspm.components.recording import RecordWriter
+from afspm.components.recording import RecordWriter, WriterLimits
 from afspm.model import (
     ControlMode,
     ControlState,
@@ -61,7 +61,9 @@ class Bench:
         self.woken = threading.Event()
         self.writers: list[RecordWriter] = []
 
-    def writer(self, step: Callable[[], contextlib.AbstractContextManager[None]] | None = None) -> RecordWriter:
+    def writer(
+        self, step: Callable[[], contextlib.AbstractContextManager[None]] | None = None, **limits: int
+    ) -> RecordWriter:
         writer = RecordWriter(
             self.folder,
             self.packets,
@@ -70,6 +72,8 @@ class Bench:
             logging.getLogger("recorder"),
             step=step or contextlib.nullcontext,
             wake=self.woken.set,
+            # after a second `finish` leaves a busy writer to itself, which would write into what a test has changed
+            limits=WriterLimits(0.02, 0.02, 0.02, 0.02, 0.02, stopping_s=DEADLINE_S, **limits),
         )
         self.writers.append(writer)
         writer.start()
@@ -99,11 +103,7 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    for name in ("AGAIN_S", "QUIET_S", "LOOK_S", "LONGEST_LOOK_S", "COMMIT_S"):
-        monkeypatch.setattr(recording, name, 0.02)
-    # after a second `finish` leaves a busy writer to itself, which would write into what a test has changed meanwhile
-    monkeypatch.setattr(recording, "STOPPING_S", DEADLINE_S)
+def bench(tmp_path: Path) -> Iterator[Bench]:
     made = Bench(tmp_path)
     yield made
     made.log.close()
@@ -133,10 +133,9 @@ def test_flood_of_packets_is_recorded_in_short_steps_that_follow_each_other(
         reads.append((len(found), is_in_step))
         return found
 
-    monkeypatch.setattr(recording, "MOST_AT_ONCE", 10)
     monkeypatch.setattr(LogReader, "read", read)
     bench.publish(*map(control, range(1, 26)))
-    writer = bench.writer(activity.step)
+    writer = bench.writer(activity.step, most_at_once=10)
     writer.finish(ended=True)
     # a heartbeat between two batches shows a recorder at work, which is not asked to end
     assert reads[:4] == [(10, False), (10, True), (5, True), (0, True)]
@@ -242,10 +241,9 @@ def test_full_disk_is_logged_once_and_all_is_recorded_once_there_is_room(
 def test_packets_dropped_while_the_disk_was_full_are_requested_again(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recording, "MOST_BYTES", 200)
     disk = _Disk(monkeypatch)
     disk.is_full = True
-    writer = bench.writer()
+    writer = bench.writer(most_bytes=200)
     writer.put(control(1), "tcp://another")
     _until(lambda: disk.refused > 0)
     packets = [control(time_ns) for time_ns in range(1, 30)]
