@@ -68,6 +68,7 @@ class RecordWriter:
         step: context manager entered around every slow operation.
         wake: called when the result of `check` or `wants_replay` may have changed.
         limits: None: the usual ones.
+        open_store: opens the record of a folder.
     """
 
     def __init__(
@@ -81,8 +82,9 @@ class RecordWriter:
         step: Callable[[], AbstractContextManager[None]],
         wake: Callable[[], None],
         limits: WriterLimits | None = None,
+        open_store: Callable[[Path, RecordSettings], RecordStore] = RecordStore,
     ) -> None:
-        self._limits = limits or WriterLimits()
+        self._limits, self._open_store = limits or WriterLimits(), open_store
         self._folder = folder
         self._settings = settings
         self._clock = clock
@@ -158,7 +160,7 @@ class RecordWriter:
         while True:
             try:
                 with self._step():
-                    return RecordStore(self._folder, self._settings)
+                    return self._open_store(self._folder, self._settings)
             except DISK_ERRORS as error:
                 if not self._put_off(error):
                     return None

@@ -62,7 +62,10 @@ class Bench:
         self.writers: list[RecordWriter] = []
 
     def writer(
-        self, step: Callable[[], contextlib.AbstractContextManager[None]] | None = None, **limits: int
+        self,
+        step: Callable[[], contextlib.AbstractContextManager[None]] | None = None,
+        open_store: Callable[[Path, RecordSettings], RecordStore] = RecordStore,
+        **limits: int,
     ) -> RecordWriter:
         writer = RecordWriter(
             self.folder,
@@ -74,6 +77,7 @@ class Bench:
             wake=self.woken.set,
             # after a second `finish` leaves a busy writer to itself, which would write into what a test has changed
             limits=WriterLimits(0.02, 0.02, 0.02, 0.02, 0.02, stopping_s=DEADLINE_S, **limits),
+            open_store=open_store,
         )
         self.writers.append(writer)
         writer.start()
@@ -221,8 +225,8 @@ def test_full_disk_is_logged_once_and_all_is_recorded_once_there_is_room(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
-    disk = _Disk(monkeypatch)
-    writer = bench.writer()
+    disk = _Disk()
+    writer = bench.writer(open_store=disk.open_store)
     _until(lambda: (bench.folder / JOURNAL_FILE).exists())
     disk.is_full = True
     for time_ns in (1, 2):
@@ -239,11 +243,11 @@ def test_full_disk_is_logged_once_and_all_is_recorded_once_there_is_room(
 
 
 def test_packets_dropped_while_the_disk_was_full_are_requested_again(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    bench: Bench,
 ) -> None:
-    disk = _Disk(monkeypatch)
+    disk = _Disk()
     disk.is_full = True
-    writer = bench.writer(most_bytes=200)
+    writer = bench.writer(open_store=disk.open_store, most_bytes=200)
     writer.put(control(1), "tcp://another")
     _until(lambda: disk.refused > 0)
     packets = [control(time_ns) for time_ns in range(1, 30)]
@@ -293,12 +297,8 @@ def test_journal_damaged_further_in_is_moved_aside_too(
     assert again.wants_replay()
 
 
-def test_error_that_ends_the_writing_is_raised_by_check(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: Any) -> None:
-        raise RuntimeError("a mistake of ours")
-
-    monkeypatch.setattr(RecordStore, "take", broken)
-    writer = bench.writer()
+def test_error_that_ends_the_writing_is_raised_by_check(bench: Bench) -> None:
+    writer = bench.writer(open_store=_BrokenStore)
     bench.publish(control(1))
     assert bench.woken.wait(DEADLINE_S)
     with pytest.raises(RuntimeError, match="mistake of ours"):
@@ -379,18 +379,29 @@ def test_reports_after_the_recorder_has_ended_are_recorded_unless_more_is_missin
 class _Disk:
     """A disk that may be full."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self) -> None:
         self.is_full = False
         self.refused = 0
-        take = RecordStore.take
 
-        def taken(store: RecordStore, packets: Any) -> None:
-            if self.is_full:
-                self.refused += 1
-                raise OSError(errno.ENOSPC, "No space left on device")
-            take(store, packets)
+    def open_store(self, folder: Path, settings: RecordSettings) -> RecordStore:
+        return _StoreOnDisk(self, folder, settings)
 
-        monkeypatch.setattr(RecordStore, "take", taken)
+
+class _StoreOnDisk(RecordStore):
+    def __init__(self, disk: _Disk, folder: Path, settings: RecordSettings) -> None:
+        self._disk = disk
+        super().__init__(folder, settings)
+
+    def take(self, packets: Any) -> None:
+        if self._disk.is_full:
+            self._disk.refused += 1
+            raise OSError(errno.ENOSPC, "No space left on device")
+        super().take(packets)
+
+
+class _BrokenStore(RecordStore):
+    def take(self, packets: Any) -> None:
+        raise RuntimeError("a mistake of ours")
 
 
 def _all_times(bench: Bench) -> list[int]:

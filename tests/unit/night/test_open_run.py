@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import sqlite3
 import sys
-import tempfile
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path, PureWindowsPath
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from record_lab import ABOUT, Night
+from temporary_folder import use_temporary_folder
 
 import afspm
 from afspm import wire
@@ -62,7 +62,7 @@ def test_copy_of_a_read_only_journal_is_removed_when_closed_or_collected(
     store.take(night.whole_scan(1))
     copies = tmp_path / "copies"
     copies.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(copies))
+    use_temporary_folder(copies, monkeypatch)
     opened = sqlite3.connect
 
     def connect(name: Any, **settings: Any) -> Any:
