@@ -222,7 +222,7 @@ def test_committed_packets_are_on_the_disk(
 
 
 def test_full_disk_is_logged_once_and_all_is_recorded_once_there_is_room(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
     disk = _Disk()

@@ -208,7 +208,7 @@ def test_beacon_reaches_only_subscribers_with_a_marker(lab: PublisherLab, plain:
 
 @pytest.mark.usefixtures("quick")
 def test_signal_of_the_end_is_repeated_for_a_subscriber_that_has_lost_it(
-    lab: PublisherLab, open_: Any, until: Any, monkeypatch: pytest.MonkeyPatch
+    lab: PublisherLab, open_: Any, until: Any
 ) -> None:
     got: list[Any] = []
     port = open_(ZmqPort(Network(), "Series", CLOCK, subscribe=[lab.address]))
