@@ -16,7 +16,7 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -42,21 +42,26 @@ RESULT = Path("build/bench.json")
 OPTIONS = {"--short", "--land"}
 
 
-def main(arguments: list[str]) -> int:
+def main(
+    arguments: list[str],
+    modules: Sequence[str] = MODULES,
+    measurements: dict[str, Measurement] = MEASUREMENTS,
+    file: Path = landed.FILE,
+) -> int:
     options, names = {one for one in arguments if one.startswith("--")}, {*arguments}
     names -= options
     if "--short" in options:
         os.environ[VARIABLE] = SHORT  # read where a measurement is imported
-    _register()
-    if unknown := (names - MEASUREMENTS.keys()) | (options - OPTIONS):
-        known = f"measurements {sorted(MEASUREMENTS)} and options {sorted(OPTIONS)}"
+    _register(modules)
+    if unknown := (names - measurements.keys()) | (options - OPTIONS):
+        known = f"measurements {sorted(measurements)} and options {sorted(OPTIONS)}"
         print(f"there is no {', '.join(sorted(unknown))}; there are {known}", file=sys.stderr)
         return 2
-    before = landed.read()
+    before = landed.read(file)
     measured: dict[str, list[Row]] = {}
     found: list[Row | Failure | Missing] = []
     print(f"{'':58} {'ours':>10} {'bare':>10} {'ratio':>7} {'landed':>7}  target", flush=True)
-    for name, measure in MEASUREMENTS.items():
+    for name, measure in measurements.items():
         if not names or name in names:
             for row in _measured(name, measure, before.get(name, {})):
                 found.append(row)
@@ -69,14 +74,14 @@ def main(arguments: list[str]) -> int:
         print(f"not measured: {missing.name}: {missing.reason}")
     failed = {row.name for row in found if isinstance(row, Failure)}
     if "--land" in options:
-        landed.write({name: rows for name, rows in measured.items() if name not in failed})
+        landed.write({name: rows for name, rows in measured.items() if name not in failed}, file)
     if failed:
         return 3
     return 0 if all(row.met for row in found if isinstance(row, Row)) else 1
 
 
-def _register() -> None:
-    for module in MODULES:
+def _register(modules: Sequence[str]) -> None:
+    for module in modules:
         try:
             importlib.import_module(f"benchmarks.{module}")
         except ImportError as error:  # it needs a package of an extra: its measurements are listed, and the others made

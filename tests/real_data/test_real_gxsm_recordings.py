@@ -5,13 +5,13 @@ from __future__ import annotations
 import ast
 import json
 import re
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from benchmarks.data_folder import DATA
+from temporary_folder import use_temporary_folder
 from tests.plugins.gxsm.gxsm_bench import Bench
 from tests.plugins.gxsm.raw_clients import client
 from tests.plugins.gxsm.recorded_gxsm import looked_at, played, publishes_no_stopped_scan, scanned_one_by_one
@@ -40,9 +40,9 @@ OTHERWISE = (
 
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Bench]]:
-    for name in ("HOME", "USERPROFILE", "TMPDIR"):  # the bridge's secret and the callers' lock are this test's own
+    for name in ("HOME", "USERPROFILE"):  # the bridge's secret and the callers' lock are this test's own
         monkeypatch.setenv(name, str(tmp_path))
-    monkeypatch.setattr(tempfile, "tempdir", None)
+    use_temporary_folder(tmp_path, monkeypatch)
     yield from benches(Bench, tmp_path)
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, Self
 
 from afspm.basics.errors import ConfigError
 from afspm.basics.plain_data import PlainMapping
@@ -143,7 +143,7 @@ class ExperimentClock:
         return cls()
 
     @classmethod
-    def starting_now(cls, start_s: float | None = None, speed: float = 1.0) -> ExperimentClock:
+    def starting_now(cls, start_s: float | None = None, speed: float = 1.0) -> Self:
         """Return a clock that shows `start_s` (default: the real time) now and runs at `speed` from then on."""
         origin_s = time.time()
         return cls(origin_s, origin_s if start_s is None else start_s, speed)

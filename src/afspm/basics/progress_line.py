@@ -12,9 +12,6 @@ from typing import Self, TextIO
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.formatting import duration_text
 
-AFTER_S, EVERY_S = 2.0, 0.5
-"""Quick work shows no line; later the seconds in the line go on, so that slow work is not taken for a hang."""
-
 
 class ProgressLine:
     """A line of text and elapsed time below the output, from two seconds after the begin of the work to its end.
@@ -26,12 +23,23 @@ class ProgressLine:
         text: description of the work, such as "writing the report".
         quiet: whether to draw nothing in any case.
         stream: where to draw; None: sys.stderr, so that output to a pipe stays clean.
+        after_s: duration of quick work, which shows no line.
+        every_s: time between two drawings: the seconds in the line go on, so that slow work is not taken for a hang.
     """
 
-    def __init__(self, text: str, *, quiet: bool = False, stream: TextIO | None = None) -> None:
+    def __init__(
+        self,
+        text: str,
+        *,
+        quiet: bool = False,
+        stream: TextIO | None = None,
+        after_s: float = 2.0,
+        every_s: float = 0.5,
+    ) -> None:
         self._text, self._step = text, ""
         self._stream = sys.stderr if stream is None else stream
         self._is_drawn = not quiet and self._stream.isatty()
+        self._after_s, self._every_s = after_s, every_s
         self._lock = threading.Lock()
         self._over = threading.Event()
         self._width = 0
@@ -61,11 +69,11 @@ class ProgressLine:
             self._thread.join()
 
     def _draw_on(self) -> None:
-        wait_s = AFTER_S
+        wait_s = self._after_s
         with suppress(OSError, ValueError):  # the terminal has gone: the work goes on
             while not self._over.wait(wait_s):
                 self._draw()
-                wait_s = EVERY_S
+                wait_s = self._every_s
             with self._lock:
                 self._erase()
 

@@ -75,11 +75,13 @@ class Targets:
         webhook: address for a POST of the JSON, or "$NAME" of the environment variable that holds it. The address may
             be a secret: logs name only its host.
         folder: working directory of the command.
+        timeout_s: limit of one attempt of the command.
     """
 
     command: Sequence[str] = ()
     webhook: str = ""
     folder: str = ""
+    timeout_s: float = TIMEOUT_S
 
     @property
     def ways(self) -> tuple[Way, ...]:
@@ -95,7 +97,7 @@ class Targets:
             ConfigError: the address of the webhook is invalid, or its environment variable is not set.
         """
         if way == "command":
-            _run(self.command, notice, self.folder)
+            _run(self.command, notice, self.folder, self.timeout_s)
         else:
             _post(address(self.webhook), notice)
 
@@ -129,7 +131,7 @@ def address(webhook: str, environment: Mapping[str, str] = os.environ, *, key: s
     return webhook
 
 
-def _run(command: Sequence[str], notice: Notification, folder: str) -> None:
+def _run(command: Sequence[str], notice: Notification, folder: str, timeout_s: float) -> None:
     program = Path(command[0]).name  # its arguments may hold a secret
     environment = {**os.environ, "AFSPM_WHAT": notice.what, "AFSPM_TEXT": notice.text, "AFSPM_RUN": notice.run}
     try:
@@ -138,13 +140,13 @@ def _run(command: Sequence[str], notice: Notification, folder: str) -> None:
             input=notice.body(),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
-            timeout=TIMEOUT_S,
+            timeout=timeout_s,
             env=environment,
             cwd=folder or None,
             check=False,
         )
     except subprocess.TimeoutExpired:
-        raise NotDelivered(f"{program} took longer than {TIMEOUT_S:g} s and was ended") from None
+        raise NotDelivered(f"{program} took longer than {timeout_s:g} s and was ended") from None
     except OSError as error:
         raise NotDelivered(f"{program} can't be run: {error.strerror or type(error).__name__}") from None
     if done.returncode:

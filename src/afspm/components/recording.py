@@ -7,6 +7,7 @@ import sqlite3
 import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,30 +19,36 @@ from afspm.record.journal import JOURNAL_FILE, SCHEDULER, damaged, is_damage
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.storage.packet_log import SEGMENT_BYTES, START, LogReader, Position, commit, committed
 
-MOST_BYTES = 256 << 20
-"""Limit in bytes on waiting packets of other publishers; beyond it all are dropped, and requested again later."""
 # backlog above which a warning is logged: the log is finite, and its oldest packets are overwritten
 FAR_BEHIND_BYTES = 64 << 20
 # limit the memory for one batch, and the length of one step: 10,000 log lines take 0.3 s of a processor
 AT_ONCE_BYTES = 32 << 20
-MOST_AT_ONCE = 10_000  # packets in one read of the log
-LOOK_S = 0.1
-"""Interval of reads of the log: delivery to other processes comes before recording."""
-LONGEST_LOOK_S = 0.25
-"""The interval of reads that find nothing: it doubles up to here, so that an idle run costs little."""
-AGAIN_S = 2.0  # between attempts while the disk has no room
-# after a silence incomplete scans are written, too: their last channel may never come
-QUIET_S = 1.0
-# each commit syncs the disk, so not after every packet
-COMMIT_S = 1.0
-# a run that stops may be resumed, and then the log is read on from the last commit: no need to wait long
 LAST_WORDS_S = 30.0
-STOPPING_S = 1.0  # for the last packets of a run that may be resumed: its log keeps the others
 
 _MOST_NAMED = 3
 _UNRECORDED = "nothing can be recorded"
 
 DISK_ERRORS = (OSError, sqlite3.OperationalError)
+
+
+@dataclass(frozen=True)
+class WriterLimits:
+    """Times, in s of real time, and sizes that limit the work of a `RecordWriter`."""
+
+    look_s: float = 0.1
+    """Interval of reads of the log: delivery to other processes comes before recording."""
+    longest_look_s: float = 0.25
+    """The interval of reads that find nothing: it doubles up to here, so that an idle run costs little."""
+    again_s: float = 2.0  # between attempts while the disk has no room
+    # after a silence incomplete scans are written, too: their last channel may never come
+    quiet_s: float = 1.0
+    # each commit syncs the disk, so not after every packet
+    commit_s: float = 1.0
+    # a run that stops may be resumed, and then the log is read on from the last commit: no need to wait long
+    stopping_s: float = 1.0
+    most_at_once: int = 10_000  # packets in one read of the log
+    most_bytes: int = 256 << 20
+    """Limit on waiting packets of other publishers; beyond it all are dropped, and requested again later."""
 
 
 class SourcedPacket(NamedTuple):
@@ -60,6 +67,8 @@ class RecordWriter:
         log: folder of the packet log; without a log, all packets are given by `put`.
         step: context manager entered around every slow operation.
         wake: called when the result of `check` or `wants_replay` may have changed.
+        limits: None: the usual ones.
+        open_store: opens the record of a folder.
     """
 
     def __init__(
@@ -72,18 +81,21 @@ class RecordWriter:
         *,
         step: Callable[[], AbstractContextManager[None]],
         wake: Callable[[], None],
+        limits: WriterLimits | None = None,
+        open_store: Callable[[Path, RecordSettings], RecordStore] = RecordStore,
     ) -> None:
+        self._limits, self._open_store = limits or WriterLimits(), open_store
         self._folder = folder
         self._settings = settings
         self._clock = clock
         self._logger = logger
         self._step = step
         self._wake = wake
-        self._progress = LogProgress(log)
-        self._inbox = RecordInbox()
+        self._progress = LogProgress(log, self._limits)
+        self._inbox = RecordInbox(self._limits)
         self._error: BaseException | None = None
         self._told_full = self._told_behind = self._told_removed = self._has_found = False
-        self._look_s = LOOK_S
+        self._look_s = self._limits.look_s
         self._heard_s = self._committed_s = clock.monotonic_s()
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
 
@@ -116,9 +128,9 @@ class RecordWriter:
         Args:
             ended: whether the experiment has ended; otherwise it may be resumed.
         """
-        within_s = LAST_WORDS_S if ended else STOPPING_S
+        within_s = LAST_WORDS_S if ended else self._limits.stopping_s
         self._inbox.end(self._clock.monotonic_s() + within_s, ended=ended)
-        self._thread.join(within_s + AGAIN_S)
+        self._thread.join(within_s + self._limits.again_s)
         self.check()
 
     # --- in the writer's thread ---
@@ -148,7 +160,7 @@ class RecordWriter:
         while True:
             try:
                 with self._step():
-                    return RecordStore(self._folder, self._settings)
+                    return self._open_store(self._folder, self._settings)
             except DISK_ERRORS as error:
                 if not self._put_off(error):
                     return None
@@ -174,11 +186,11 @@ class RecordWriter:
             self._heard_s = now_s
             if not self._safely(lambda: store.take((one.packet, one.source) for one in batch)):
                 self._progress.stop()
-        elif ending is None and now_s > self._heard_s + QUIET_S:
+        elif ending is None and now_s > self._heard_s + self._limits.quiet_s:
             self._safely(store.flush)
         with self._step():
             self._progress.took(batch, store.waiting())
-        if now_s > self._committed_s + COMMIT_S:
+        if now_s > self._committed_s + self._limits.commit_s:
             self._commit(store)
         if ending is None or batch:
             return True
@@ -199,7 +211,8 @@ class RecordWriter:
         self._tell_behind()
         found = [*logged, *queued]
         self._has_found = bool(found)
-        self._look_s = LOOK_S if found else min(2.0 * self._look_s, LONGEST_LOOK_S)
+        limits = self._limits
+        self._look_s = limits.look_s if found else min(2.0 * self._look_s, limits.longest_look_s)
         return found, ending
 
     def _tell_behind(self) -> None:
@@ -277,7 +290,8 @@ class RecordWriter:
 class RecordInbox:
     """Packets that wait to be recorded, and the request to end: the state shared by listener and writer."""
 
-    def __init__(self) -> None:
+    def __init__(self, limits: WriterLimits) -> None:
+        self._limits = limits
         self._changed = threading.Condition()
         self._queue: list[SourcedPacket] = []
         self._bytes = 0
@@ -287,11 +301,11 @@ class RecordInbox:
         self._until_s = 0.0
 
     def put(self, packet: SourcedPacket, *, is_disk_full: bool) -> None:
-        """Queue a packet. If more than MOST_BYTES wait on a full disk, all are dropped, and requested again later."""
+        """Queue a packet. If more than `most_bytes` wait on a full disk, all are dropped, and requested again later."""
         with self._changed:
             self._queue.append(packet)
             self._bytes += len(packet.packet.payload)
-            if self._bytes > MOST_BYTES and is_disk_full:
+            if self._bytes > self._limits.most_bytes and is_disk_full:
                 self._queue.clear()
                 self._bytes, self._missed = 0, True
             self._changed.notify()
@@ -315,7 +329,8 @@ class RecordInbox:
     def pause(self) -> float | None:
         """Wait a moment for room on the disk; return the time limit for such waits, None without a limit."""
         with self._changed:
-            self._changed.wait_for(lambda: False, AGAIN_S if self._ending is None else AGAIN_S / 10)
+            again_s = self._limits.again_s
+            self._changed.wait_for(lambda: False, again_s if self._ending is None else again_s / 10)
             return None if self._ending is None else self._until_s
 
     def want_replay(self) -> None:
@@ -343,8 +358,8 @@ class LogProgress:
         log: folder of the packet log; it may be missing.
     """
 
-    def __init__(self, log: Path) -> None:
-        self._log = log
+    def __init__(self, log: Path, limits: WriterLimits) -> None:
+        self._log, self._limits = log, limits
         self._reader = LogReader(log, committed(log) or START)
         self._committed = self._reader.position
         self._stopped = False
@@ -362,7 +377,7 @@ class LogProgress:
         """Return the next packets of the log, a limited number of bytes at a time."""
         before = self._reader.position
         found = []
-        for entry, behind in self._reader.read(AT_ONCE_BYTES, MOST_AT_ONCE):
+        for entry, behind in self._reader.read(AT_ONCE_BYTES, self._limits.most_at_once):
             found.append(SourcedPacket(entry.packet, SCHEDULER, before))
             before = behind
         return found

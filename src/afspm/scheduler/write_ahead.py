@@ -99,6 +99,7 @@ class WriteAhead:
     Args:
         log: the packet log; None: no packets are stored.
         cached: returns the packets in the scheduler's cache.
+        disk: the thread that writes; None: one of its own.
     """
 
     def __init__(
@@ -107,11 +108,12 @@ class WriteAhead:
         log: PacketLog | None,
         cached: Callable[[], Iterable[LoggedPacket]],
         logger: logging.Logger,
+        disk: DiskThread | None = None,
     ) -> None:
         self._state = state
         self._log = log
         self._cached = cached
-        self._disk = DiskThread()
+        self._disk = disk or DiskThread()
         self._outage = OutageLog("packets published now would be lost in a crash", logger)
         self._given_up = OutageLog("packets are given up that are not recorded yet", logger)
         self._missed_ns: int | None = None

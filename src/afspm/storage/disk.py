@@ -175,8 +175,8 @@ class Syncer:
     drops the data of a failed sync, and a power cut loses them.
     """
 
-    def __init__(self, period_s: float = SYNC_PERIOD_S) -> None:
-        self._period_s = period_s
+    def __init__(self, period_s: float = SYNC_PERIOD_S, sync: Callable[[int], None] | None = None) -> None:
+        self._period_s, self._sync = period_s, sync
         self._changed = threading.Condition()
         self._written: dict[tuple[int, int], int] = {}
         self._urgent = False
@@ -232,7 +232,11 @@ class Syncer:
                 self._changed.wait_for(lambda: self._urgent, self._period_s)
                 written, self._written = self._written, {}
                 asked, self._urgent = self._asked, False
-            failures = [error for descriptor in written.values() if (error := _sync_and_close(descriptor)) is not None]
+            failures = [
+                error
+                for descriptor in written.values()
+                if (error := _sync_and_close(descriptor, self._sync or sync_data)) is not None
+            ]
             if written:
                 self._log_change(failures)
             with self._changed:
@@ -248,12 +252,12 @@ class Syncer:
             _log.info("the disk syncs again")
 
 
-def is_full(folder: Path) -> bool:
+def is_full(folder: Path, least_free: int = FULL_BYTES) -> bool:
     """Return whether a disk has no room for another file; False if unknown."""
     import shutil  # imported late: needed only after a failure
 
     try:
-        return shutil.disk_usage(folder).free < FULL_BYTES
+        return shutil.disk_usage(folder).free < least_free
     except OSError:
         return False
 
@@ -266,9 +270,9 @@ _CAN_NOT_SYNC = (errno.EINVAL, errno.ENOTSUP)
 """Errors of network file systems for the sync of a folder: they have nothing to sync."""
 
 
-def _sync_and_close(descriptor: int) -> OSError | None:
+def _sync_and_close(descriptor: int, sync: Callable[[int], None]) -> OSError | None:
     try:
-        sync_data(descriptor)
+        sync(descriptor)
     except OSError as error:
         return None if error.errno in _CAN_NOT_SYNC else error
     finally:

@@ -28,9 +28,8 @@ LOG_FOLDER = "packets"
 """Folder of the log, in the state folder of a run."""
 COMMITTED_FILE = "recorded"
 """File in the log's folder with the committed position, if there is a recorder."""
-SEGMENT_BYTES = 16 << 20  # of one file, after which the next begins
+SEGMENT_BYTES = 16 << 20
 CAPACITY_BYTES = 64 << 20
-"""Size up to which no segment is freed; twice the size of the cached packets, if that is larger."""
 MOST_UNRECORDED_BYTES = 1 << 30  # beyond the usual size; above it unrecorded packets are dropped
 SPARE_BYTES = 256 << 20
 """Largest size of all spare files together, enough for a flood of packets until it is recorded."""
@@ -55,13 +54,23 @@ class PacketLog:
         folder: created with the first packet.
         most_unrecorded_bytes: largest growth of the log above its usual size while packets wait for the recorder; above
             it the oldest packets are dropped.
+        segment_bytes: size of one file, after which the next begins.
+        capacity_bytes: size up to which no segment is freed; twice the size of the cached packets, if that is larger.
 
     Attributes:
         has_grown: whether a segment was filled since the last `clean`; True before the first `clean`.
     """
 
-    def __init__(self, folder: Path, *, most_unrecorded_bytes: int = MOST_UNRECORDED_BYTES) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        most_unrecorded_bytes: int = MOST_UNRECORDED_BYTES,
+        segment_bytes: int = SEGMENT_BYTES,
+        capacity_bytes: int = CAPACITY_BYTES,
+    ) -> None:
         self._folder = folder
+        self._segment_bytes, self._capacity_bytes = segment_bytes, capacity_bytes
         self._most_unrecorded_bytes = most_unrecorded_bytes
         self._segment: SegmentWriter | None = None
         self._full = deque((path, path.stat().st_size) for path in segments(folder))
@@ -78,7 +87,7 @@ class PacketLog:
         Raises:
             OSError: the disk refuses (full …); then no part of the packet is in the log.
         """
-        if self._segment is not None and self._segment.size >= SEGMENT_BYTES:
+        if self._segment is not None and self._segment.size >= self._segment_bytes:
             self.close()
         segment = self._segment = self._segment or self._opened()
         try:
@@ -99,7 +108,7 @@ class PacketLog:
         """
         self.has_grown = False
         live = {entry.packet.time_ns: len(entry.packet.payload) for entry in cached}
-        limit = max(CAPACITY_BYTES, 2 * sum(live.values()))
+        limit = max(self._capacity_bytes, 2 * sum(live.values()))
         recorded = committed(self._folder)
         all_recorded = True
         while self._full and self._size > limit:
@@ -152,7 +161,7 @@ class PacketLog:
             except OSError:  # Windows renames no file that is open for a read or sync: the next call tries again
                 self._done_with.append(path)
         with contextlib.suppress(OSError):
-            while len(self._spare) > SPARE_BYTES // SEGMENT_BYTES:
+            while len(self._spare) > SPARE_BYTES // self._segment_bytes:
                 self._spare[0].unlink()
                 del self._spare[0]
 

@@ -13,10 +13,6 @@ from afspm.basics.clock import NS_PER_S, ExperimentClock
 from afspm.basics.formatting import counted, duration_text
 from afspm.basics.shared_time import LONGEST_HOLD_S, SharedTime, TimeHold
 
-LOOK_EVERY_S = 1.0  # real time
-LONG_S = 60.0
-"""Real time after which a wait is logged. On a quiet computer a wait takes a second."""
-
 
 @dataclass(frozen=True)
 class Drop:
@@ -40,14 +36,23 @@ class HoldWatch:
     Args:
         log: writes a line with a level.
         names: returns the names of the run's processes by their process ids.
+        every_s: real time from one look to the next.
+        long_s: real time after which a wait is logged. On a quiet computer a wait takes a second.
 
     Attributes:
         given_up: number of waits for a living process that were given up, or for which there was no room.
     """
 
     def __init__(
-        self, clock: ExperimentClock, log: Callable[[int, str], None], names: Callable[[], dict[int, str]]
+        self,
+        clock: ExperimentClock,
+        log: Callable[[int, str], None],
+        names: Callable[[], dict[int, str]],
+        *,
+        every_s: float = 1.0,
+        long_s: float = 60.0,
     ) -> None:
+        self._every_s, self._long_s = every_s, long_s
         self._clock, self._log, self._names = clock, log, names
         self._next_s = -math.inf
         self._logged: set[tuple[int, int]] = set()
@@ -55,11 +60,11 @@ class HoldWatch:
         self.given_up = 0
 
     def look(self) -> None:
-        """Look at the holds, at most every `LOOK_EVERY_S`. Never waits for another process."""
+        """Look at the holds, at most every `every_s`. Never waits for another process."""
         now_s = self._clock.monotonic_s()
         if now_s < self._next_s or (shared := self._clock.holds()) is None:
             return
-        self._next_s = now_s + LOOK_EVERY_S
+        self._next_s = now_s + self._every_s
         real_ns = int(now_s * NS_PER_S)
         for drop in drops(shared, real_ns, psutil.pid_exists):
             if self._clock.drop(drop.hold):
@@ -89,7 +94,7 @@ class HoldWatch:
         long = {
             (one.begun_ns, one.pid): one
             for one in shared.holds
-            if one.until_ns > real_ns and one.waited_s(real_ns) >= LONG_S
+            if one.until_ns > real_ns and one.waited_s(real_ns) >= self._long_s
         }
         for key in long.keys() - self._logged:
             waited = duration_text(long[key].waited_s(real_ns))

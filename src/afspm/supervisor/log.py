@@ -27,7 +27,6 @@ CLOCK = ExperimentClock.real()
 # lines that wait for a blocked terminal or disk; beyond it the oldest are dropped
 MOST_UNSHOWN = 10_000
 _HANGS = "the disk has not answered for {:.0f} s: log.txt is written once it does, and the run goes on"
-SHOWN_WITHIN_S = 2.0  # at the end, for the lines that wait for a blocked terminal
 COLOURS = ("cyan", "green", "magenta", "blue", "bright_cyan", "bright_green", "bright_magenta", "bright_blue")
 LEVEL_STYLES = {logging.WARNING: "yellow", logging.ERROR: "bold red", logging.CRITICAL: "bold red"}
 _LEVELS = {name: getattr(logging, name) for name in ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")}
@@ -78,8 +77,12 @@ class RunLog:
         terminal: TextIO | None = None,
         level: int = logging.INFO,
         names: Iterable[str] = (),
+        shown_within_s: float = 2.0,
+        slow_s: float = SLOW_S,
     ) -> None:
-        self._file = _Shown(*_writer_to(file))
+        self._slow_s = slow_s
+        # the time at the end for the lines that wait for a blocked terminal
+        self._file = _Shown(*_writer_to(file), within_s=shown_within_s)
         self._clock = clock
         self._wall = ExperimentClock.real()
         self._level = level
@@ -87,7 +90,7 @@ class RunLog:
         self.listener: Callable[[str, int, str], None] = lambda name, level, text: None
         """Function that is called with the arguments of each `write`."""
         self._hangs = False
-        self._shown = _Shown(_coloured(terminal) if terminal.isatty() else _plain(terminal))
+        self._shown = _Shown(_coloured(terminal) if terminal.isatty() else _plain(terminal), within_s=shown_within_s)
         self._widest = max(map(len, (LOGGED_AS, *names)))
 
     def write(self, name: str, level: int, text: str) -> None:
@@ -96,9 +99,9 @@ class RunLog:
         stamp = f"{day_and_time(wall_ns)}.{wall_ns // 1_000_000 % 1000:03d}{self._experiment_time()}"
         self._file.add(stamp, f"{name:{self._widest}}", level, text)
         self._tell(name, level, text, wall_ns)
-        hung, self._hangs = self._hangs, self._file.hangs(SLOW_S)
+        hung, self._hangs = self._hangs, self._file.hangs(self._slow_s)
         if self._hangs and not hung:
-            self._tell(LOGGED_AS, logging.WARNING, _HANGS.format(SLOW_S), wall_ns)
+            self._tell(LOGGED_AS, logging.WARNING, _HANGS.format(self._slow_s), wall_ns)
 
     def _tell(self, name: str, level: int, text: str, wall_ns: int) -> None:
         self.listener(name, level, text)
@@ -129,8 +132,8 @@ Show = Callable[[str, str, int, str], None]
 class _Shown:
     """A writer of lines in a thread of its own, which may wait for the terminal or the disk."""
 
-    def __init__(self, show: Show, finish: Callable[[], None] = lambda: None) -> None:
-        self._show = show
+    def __init__(self, show: Show, finish: Callable[[], None] = lambda: None, *, within_s: float) -> None:
+        self._show, self._within_s = show, within_s
         self._finish = finish
         self._lines: deque[tuple[str, str, int, str]] = deque(maxlen=MOST_UNSHOWN)
         self._changed = threading.Condition()
@@ -146,11 +149,11 @@ class _Shown:
             self._changed.notify()
 
     def close(self) -> None:
-        """Write the waiting lines, for SHOWN_WITHIN_S at most."""
+        """Write the waiting lines, for `within_s` at most."""
         with self._changed:
             self._closing = True
             self._changed.notify()
-        self._thread.join(SHOWN_WITHIN_S)
+        self._thread.join(self._within_s)
 
     def _run(self) -> None:
         while (line := self._next()) is not None:

@@ -32,7 +32,7 @@ from afspm.supervisor.supervision.run_end import EndReason
 from afspm.transport.process import signals
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from afspm.experiment import Experiment, ProcessStart
     from afspm.supervisor.log import RunLog
@@ -141,24 +141,35 @@ def _times(count: int) -> str:
     return {1: "once", 2: "twice"}.get(count, f"{count} times")
 
 
-def report(folder: Path, log: RunLog) -> None:
+def report(
+    folder: Path,
+    log: RunLog,
+    *,
+    command: Sequence[str] = (),
+    stalled_s: float = REPORT_STALLED_S,
+    processor_s: Callable[[int], float] | None = None,
+) -> None:
     """Write the report of a recorded run, in a separate process; log a failure.
 
     A crash of a plotting library then costs the report, not the exit code of the run.
 
-    The process is given up only if it has used no processor for `REPORT_STALLED_S`, as on a disk that hangs: on a busy
+    The process is given up only if it has used no processor for `stalled_s`, as on a disk that hangs: on a busy
     computer the report of a long night takes long.
+
+    Args:
+        command: the program that writes it, instead of afspm's own.
+        processor_s: returns the processor time that a process has used; None: as the system counts it.
     """
     if not (folder / JOURNAL_FILE).is_file():
         return  # no record, no report
     log.write(LOGGED_AS, logging.INFO, "writing the report …")
     again = f"`afspm report {quoted(folder)}` writes it"
-    command = [*python_command("afspm.report"), str(folder)]
+    command = command or [*python_command("afspm.report"), str(folder)]
     environment = {**os.environ, **python_environment(), "MPLBACKEND": "agg"}
     stop = _Stop()
     try:
         with signals.caught(stop, -1), ProgressLine("writing the report"):
-            exit_code, output = _until_done(command, environment, stop)
+            exit_code, output = _until_done(command, environment, stop, stalled_s, processor_s or _processor_s)
     except _Stopped as stopped:
         log.write(LOGGED_AS, logging.WARNING, f"no report: {stopped} came while it was written; {again}")
         if stopped.number == signal.SIGINT:
@@ -166,7 +177,7 @@ def report(folder: Path, log: RunLog) -> None:
         signal.raise_signal(stopped.number)
         return
     except subprocess.TimeoutExpired:
-        stalled = f"its process has not worked for {REPORT_STALLED_S:g} s, as if the disk did not answer"
+        stalled = f"its process has not worked for {stalled_s:g} s, as if the disk did not answer"
         log.write(LOGGED_AS, logging.WARNING, f"no report: {stalled}; {again}")
         return
     except OSError as error:
@@ -209,18 +220,24 @@ class _Stop:
             raise _Stopped(self.came)
 
 
-def _until_done(command: Sequence[str], environment: Mapping[str, str], stop: _Stop) -> tuple[int, bytes]:
-    # raises TimeoutExpired once the process has used no processor for REPORT_STALLED_S
+def _until_done(
+    command: Sequence[str],
+    environment: Mapping[str, str],
+    stop: _Stop,
+    stalled_s: float,
+    processor_s: Callable[[int], float],
+) -> tuple[int, bytes]:
+    # raises TimeoutExpired once the process has used no processor for `stalled_s`
     none, pipe = subprocess.DEVNULL, subprocess.PIPE
     with subprocess.Popen(command, stdin=none, stdout=none, stderr=pipe, env=environment) as process:
         used_s = -1.0
         while True:
             try:
                 stop.started()
-                _, errors = process.communicate(timeout=REPORT_STALLED_S)
+                _, errors = process.communicate(timeout=stalled_s)
                 return process.returncode, errors
             except subprocess.TimeoutExpired:
-                before_s, used_s = used_s, _processor_s(process.pid)
+                before_s, used_s = used_s, processor_s(process.pid)
                 if used_s <= before_s:
                     process.kill()
                     raise

@@ -31,9 +31,8 @@ QUEUE_LENGTH = 4000
 """Limit of waiting messages for one peer; a publisher drops further messages."""
 
 _LINGER_MS = 200  # for the last messages of a socket that is closed
-# ZMTP heartbeats: a peer that is frozen or cut off is noticed within seconds, not after hours as by TCP.
 _ALIVE_CHECK_MS = 2_000
-_ALIVE_TIMEOUT_MS = _ANSWERED_WITHIN_MS = round(CUT_OFF_SHOWS_WITHIN_S * 1e3) - _ALIVE_CHECK_MS
+_ALIVE_TIMEOUT_MS = round(CUT_OFF_SHOWS_WITHIN_S * 1e3) - _ALIVE_CHECK_MS
 # libzmq 4.3.5 aborts the process (`Assertion failed: !_io_error`) if it sends or answers a heartbeat of ZMTP on a
 # connection that was lost while its receive queue was full. So the receive queues of sockets with heartbeats, and of
 # their peers, are unlimited.
@@ -42,20 +41,14 @@ _ALIVE_TIMEOUT_MS = _ANSWERED_WITHIN_MS = round(CUT_OFF_SHOWS_WITHIN_S * 1e3) - 
 # behind unsent packets they would never leave.
 # For libzmq only a whole frame is a sign of life, not its bytes: behind 33 MB on a slow link, the answer to a heartbeat
 # would come too late, and the frame would be sent again from its first byte, without end. So a subscriber awaits no
-# answers. On a cut link its heartbeats are not acknowledged, which ends its connection (`_STALLED_MS`; on macOS
+# answers. On a cut link its heartbeats are not acknowledged, which ends its connection (`LinkTimes.stalled`; on macOS
 # keepalive ends it, by the time since the last byte). Requests and answers are short: 1 MB takes 8 s at 131 kB/s.
 _WITH_HEARTBEATS = frozenset({zmq.ROUTER, zmq.DEALER, zmq.XSUB})
 _UNLIMITED = frozenset({*_WITH_HEARTBEATS, zmq.XPUB, zmq.SUB})
 _KEEPALIVE_S, _KEEPALIVE_TRIES = 2, 3
-# A TCP peer that reads nothing is disconnected after this time, and its waiting packets are dropped. After a
-# reconnection it requests them. (Linux and Windows.)
-_STALLED_MS = 5_000
 _WINDOWS_MAXRT = 5  # from ws2ipdef.h; Python's socket module lacks it
 _RECONNECT_MS, _RECONNECT_MAX_MS = 20, 200  # the first wait before a new attempt, and the longest
 _HANDSHAKE_MS = 5_000  # for greeting and keys of a new connection, which is closed then
-# Systems repeat an attempt to connect after 1, 3, 7, 15, 31 s …: an attempt begun while the link was down would notice
-# its return only after half a minute. So attempts are ended after this time, and begun again.
-_CONNECT_MS = 2_000
 _OPTIONS = (
     (zmq.LINGER, _LINGER_MS),
     (zmq.SNDHWM, QUEUE_LENGTH),
@@ -66,8 +59,22 @@ _OPTIONS = (
     (zmq.RECONNECT_IVL, _RECONNECT_MS),
     (zmq.RECONNECT_IVL_MAX, _RECONNECT_MAX_MS),
     (zmq.HANDSHAKE_IVL, _HANDSHAKE_MS),
-    (zmq.CONNECT_TIMEOUT, _CONNECT_MS),
 )
+
+
+class LinkTimes(NamedTuple):
+    """Times of the links of a `Network`, in ms; a time of 0 turns the heartbeats, or what they wait for, off."""
+
+    # heartbeats of ZMTP: a peer that is frozen or cut off is noticed within seconds, not after hours as by TCP
+    check: int = _ALIVE_CHECK_MS
+    alive: int = _ALIVE_TIMEOUT_MS
+    answered: int = _ALIVE_TIMEOUT_MS
+    # A TCP peer that reads nothing is disconnected after this time, and its waiting packets are dropped. After a
+    # reconnection it requests them. (Linux and Windows.)
+    stalled: int = 5_000
+    # Systems repeat an attempt to connect after 1, 3, 7, 15, 31 s …: an attempt begun while the link was down would
+    # notice its return only after half a minute. So attempts are ended after this time, and begun again.
+    connect: int = 2_000
 
 
 @cache
@@ -83,15 +90,15 @@ def _can_end_stalled() -> bool:
     return True
 
 
-def _heartbeats(kind: int) -> tuple[tuple[int, int], ...]:
+def _heartbeats(kind: int, times: LinkTimes) -> tuple[tuple[int, int], ...]:
     if kind not in _WITH_HEARTBEATS:
         return ()
     # without TCP_MAXRT (Wine) nothing else ends the connection of a subscriber that is cut off
     awaits_answers = kind != zmq.XSUB or not _can_end_stalled()
     return (
-        (zmq.HEARTBEAT_IVL, _ALIVE_CHECK_MS),
-        (zmq.HEARTBEAT_TIMEOUT, _ANSWERED_WITHIN_MS if awaits_answers else 0),
-        (zmq.HEARTBEAT_TTL, _ALIVE_TIMEOUT_MS),
+        (zmq.HEARTBEAT_IVL, times.check),
+        (zmq.HEARTBEAT_TIMEOUT, times.answered if awaits_answers else 0),
+        (zmq.HEARTBEAT_TTL, times.alive),
     )
 
 
@@ -102,11 +109,12 @@ class Network:
         keys: keys of this process. Connections with keys are encrypted, and the owners of their keys are known.
             `Keys.everywhere` and `Keys.guards` choose these connections.
         insecure: whether to bind and connect to other computers without keys. Anyone there can then move the tip.
+        times: times after which links are checked, ended and made again.
     """
 
-    def __init__(self, keys: Keys | None = None, *, insecure: bool = False) -> None:
+    def __init__(self, keys: Keys | None = None, *, insecure: bool = False, times: LinkTimes | None = None) -> None:
         self.keys = keys
-        self._insecure = insecure
+        self._insecure, self._times = insecure, times or LinkTimes()
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._sockets: list[zmq.Socket[bytes]] = []
         self._authenticator = None
@@ -143,9 +151,9 @@ class Network:
         """Return a socket with afspm's limits; a frame over `max_bytes` ends its connection."""
         socket = self._context.socket(kind)
         self._sockets.append(socket)  # a reference, else the garbage collector may close the socket at any time
-        options = _OPTIONS + _heartbeats(kind)
+        options = (*_OPTIONS, (zmq.CONNECT_TIMEOUT, self._times.connect), *_heartbeats(kind, self._times))
         if _can_end_stalled():
-            options += ((zmq.TCP_MAXRT, _STALLED_MS),)
+            options += ((zmq.TCP_MAXRT, self._times.stalled),)
         for option, value in (
             *options,
             (zmq.RCVHWM, 0 if kind in _UNLIMITED else QUEUE_LENGTH),

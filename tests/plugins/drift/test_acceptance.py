@@ -83,7 +83,9 @@ def test_errors_have_the_covariance_of_the_doubt_though_some_are_far_off() -> No
         outcomes.append(
             _outcome(seed, GOOD, wrong=False, chi2=chi2, cell=fit.WANDERING[0], varied=varied, shared=shared)
         )
-    doubt = fit._doubt(outcomes)
+    module: dict[str, Any] = {}
+    exec(fit.with_doubt(outcomes), module)
+    doubt = module["DOUBT"]
     assert doubt["varied"] == pytest.approx(1.5, abs=0.15)
     assert doubt["shared"] == pytest.approx(0.0, abs=0.15)
 

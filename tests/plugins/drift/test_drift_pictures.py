@@ -28,11 +28,28 @@ SETTINGS: dict[str, Any] = {"surface": {"kind": "particles"}, "drift": {"velocit
 PIXELS, EVERY_S, SWITCHED_ON = 48, 600.0, 4
 
 
-@pytest.fixture(autouse=True)
-def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw coarsely: the look of a figure is not tested here."""
-    monkeypatch.setattr("afspm.plugins.drift.report.style.DPI", 30)
-    monkeypatch.setattr("afspm.plugins.drift.report.style.LAYOUT", None)
+pytestmark = pytest.mark.usefixtures("coarse")
+
+
+class Hurried(DriftPictures):
+    """Compares nothing at the end."""
+
+    compared_within_s = 0.0
+
+
+class HurriedAndIdle(Hurried):
+    """Repeats no comparison after a restart, as if the end came at once."""
+
+    def on_tick(self) -> None:
+        pass
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The runs of which figures would be drawn."""
+    found: list[Any] = []
+    monkeypatch.setattr("afspm.plugins.drift.report.album.write", lambda run, *_, **__: found.append(run) or [])
+    return found
 
 
 def test_the_scan_during_which_correction_was_switched_on_belongs_to_no_part() -> None:
@@ -110,12 +127,8 @@ def test_the_table_and_all_figures_are_there_when_the_experiment_has_ended(tmp_p
     }  # fmt: skip
 
 
-def test_scans_are_drawn_at_their_middle_where_the_file_has_the_end_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_scans_are_drawn_at_their_middle_where_the_file_has_the_end_alone(tmp_path: Path, drawn: list[Any]) -> None:
     # paper F3: the matrix, Park and Nanosurf: the true drift was drawn half a scan beside its time
-    drawn: list[Any] = []
-    monkeypatch.setattr("afspm.plugins.drift.report.album.write", lambda one, *_, **__: drawn.append(one) or [])
     lab = night(tmp_path, with_speed=False)
     lab.at(1500.0, lab.kill)
     run(DriftPictures("topography", "correlation"), lab, tmp_path / "state", run_dir=str(tmp_path), simulated=True)
@@ -138,25 +151,21 @@ def test_a_restart_loses_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "drift_errors.png").exists(), "the truth is for simulated microscopes"
 
 
-def test_comparisons_before_a_restart_are_repeated_before_the_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_comparisons_before_a_restart_are_repeated_before_the_end(tmp_path: Path, drawn: list[Any]) -> None:
     lab = night(tmp_path)
     lab.at(850.0, lab.parent_goes)
     quick = {"estimator": "correlation", "features": "correlation"}
     DriftPictures(**quick).run_process(context_of(lab, tmp_path / "state", run_dir=str(tmp_path)))
     lab.restart_component()
-    component, left = DriftPictures(**quick), list[int]()
-    pairs_at_end = DriftPictures.on_end
-    monkeypatch.setattr(DriftPictures, "on_end", lambda self: left.append(6 - len(self._pairs)) or pairs_at_end(self))
-    monkeypatch.setattr("afspm.plugins.drift.report.album.write", lambda *_, **__: [])
     lab.at(1500.0, lab.kill)
-    run(component, lab, tmp_path / "state", run_dir=str(tmp_path))
-    assert left == [0]
+    run(Hurried(**quick), lab, tmp_path / "state", run_dir=str(tmp_path))
+    *_, shown = drawn
+    assert len(shown.parts) == 2
+    assert all(part.estimates is not None for part in shown.parts), "what was not compared before is left out"
 
 
 def test_figures_without_comparisons_are_drawn_when_time_is_short(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     lab = night(tmp_path)
     lab.at(850.0, lab.parent_goes)
@@ -165,10 +174,8 @@ def test_figures_without_comparisons_are_drawn_when_time_is_short(
     for path in tmp_path.glob("*.png"):
         path.unlink()
     lab.restart_component()
-    monkeypatch.setattr("afspm.plugins.drift.report.drift_pictures._COMPARED_WITHIN_S", 0.0)
-    monkeypatch.setattr(DriftPictures, "on_tick", lambda self: None)
     lab.at(1500.0, lab.kill)
-    run(DriftPictures(**quick), lab, tmp_path / "state", run_dir=str(tmp_path))
+    run(HurriedAndIdle(**quick), lab, tmp_path / "state", run_dir=str(tmp_path))
     assert (tmp_path / "drift_pairs.png").exists()
     assert not (tmp_path / "drift_estimates_off.png").exists()
     (line,) = [record for record in caplog.records if "drift_estimates_off.png" in record.message]
@@ -176,10 +183,8 @@ def test_figures_without_comparisons_are_drawn_when_time_is_short(
     assert "3 of 3 comparisons" in line.message
 
 
-def test_scans_of_a_night_are_never_all_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scans_of_a_night_are_never_all_in_memory(tmp_path: Path, drawn: list[Any]) -> None:
     lab = night(tmp_path)
-    drawn = []
-    monkeypatch.setattr("afspm.plugins.drift.report.album.write", lambda run, *_, **__: drawn.append(run) or [])
     lab.at(1500.0, lab.kill)
     run(DriftPictures(estimator="correlation"), lab, tmp_path / "state", run_dir=str(tmp_path))
     (album,) = drawn

@@ -72,13 +72,12 @@ def test_drawn_pairs_have_the_given_time_apart_and_are_spread_over_the_run() -> 
     assert spread_pairs(run[:1], 7200.0, 2) == []
 
 
-def test_an_album_contains_every_figure_with_material(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("coarse")
+def test_an_album_contains_every_figure_with_material(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     from afspm.plugins.drift.registration import Matches
-    from afspm.plugins.drift.report import album, style
+    from afspm.plugins.drift.report import album
 
-    monkeypatch.setattr(style, "DPI", 30)
-    monkeypatch.setattr(style, "LAYOUT", None)
     run = record(12)
     scans = [DriftScan(np.random.default_rng(k).normal(size=(16, 16)), REGION, t, t) for k, t in enumerate(run.time_s)]
     at = np.random.default_rng(1).uniform(0.5e-6, 1.5e-6, (9, 2))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from temporary_folder import use_temporary_folder
 from tests.plugins.gxsm.gxsm_bench import Bench
 from tests.plugins.vendor_bench import benches
 
@@ -38,5 +38,4 @@ def own_lock(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest
     """Give each test its own lock file: callers of all GXSMs on one computer share one."""
     if is_real(request):
         return
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    monkeypatch.setattr(tempfile, "tempdir", None)
+    use_temporary_folder(tmp_path, monkeypatch)

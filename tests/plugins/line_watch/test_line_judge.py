@@ -26,6 +26,8 @@ from afspm.plugins.line_watch.registration import RowTemplate
 
 Heights = list[np.ndarray[tuple[int, int], np.dtype[np.float64]]]
 KIND = Kind.of(HOME, (ROWS, ROWS), "")
+USUAL_M = 3.3e-10 / np.sqrt(2.0)
+"""The noise of one scan: the judge finds 0.33 nm in the difference of two, with and without the retrace."""
 
 
 def heights(picture: Picture) -> Heights:
@@ -88,8 +90,7 @@ def test_scan_at_another_setpoint_is_another_kind() -> None:
 
 def test_more_noise_with_the_same_image_is_reported_as_noise() -> None:
     random = np.random.default_rng(3)
-    usual_m = LineStatistic(taught()._kinds[0].pairs).flat_m / np.sqrt(2.0)  # of the difference of two scans
-    noisy = [values + 1.5 * usual_m * random.standard_normal(values.shape) for values in heights(night()[LEARNT])]
+    noisy = [values + 1.5 * USUAL_M * random.standard_normal(values.shape) for values in heights(night()[LEARNT])]
     running = taught().begin(HOME, KIND, LEARNT * PERIOD_S, channels=2)
     assert running is not None
     for row in range(ROWS):
@@ -104,10 +105,9 @@ def test_more_noise_with_the_same_image_is_reported_as_noise() -> None:
 
 @pytest.mark.parametrize("period_px", [7.3, 18.0, 45.0])
 def test_hum_is_no_change(period_px: float) -> None:
-    usual_m = LineStatistic(taught()._kinds[0].pairs).flat_m / np.sqrt(2.0)
     time = 2.0 * ROWS * np.arange(ROWS)[:, None] + np.arange(ROWS)
     humming = [
-        values + 2.0 * usual_m * np.sin(2.0 * np.pi * at / period_px)
+        values + 2.0 * USUAL_M * np.sin(2.0 * np.pi * at / period_px)
         for values, at in zip(heights(night()[LEARNT]), (time, time[:, ::-1] + ROWS), strict=True)
     ]
     assert stopped(taught(), humming) is None
@@ -123,8 +123,7 @@ def taught_without_retrace() -> LineJudge:
 def alarms_without_retrace(judge: LineJudge, picture: Picture, at_s: float, hum: float) -> tuple[list[Alarm], float]:
     """Return the alarms of a trace with a hum that is in step in all rows, and the noise at its end."""
     heights_m = heights(picture)[0]
-    usual_m = LineStatistic(judge._kinds[0].pairs).flat_m / np.sqrt(2.0)
-    heights_m += hum * usual_m * np.sin(2.0 * np.pi * np.arange(ROWS) * 11.0 / 128.0)
+    heights_m += hum * USUAL_M * np.sin(2.0 * np.pi * np.arange(ROWS) * 11.0 / 128.0)
     running = judge.begin(HOME, KIND, at_s, channels=1)
     assert running is not None
     found = [alarm for row in range(ROWS) if (alarm := running.add(row, [heights_m[row]])) is not None]

@@ -25,6 +25,7 @@ class Emulated(AtPanel, NanonisEmulator):
         super().__init__(**settings)
         self.scan_ended = Event()
         self.ends_as_awaited = False
+        self.loses = ""  # a function at whose request the connection is cut
         self.asked: dict[int, list[str]] = defaultdict(list)
 
     def tick(self, now_s: float) -> float | None:
@@ -38,7 +39,10 @@ class Emulated(AtPanel, NanonisEmulator):
 
     def _answer(self, connection: ClientConnection, asked: NanonisRequest, *rest: Any) -> None:
         self.asked[connection.socket.getsockname()[1]].append(asked.name)
-        super()._answer(connection, asked, *rest)
+        if asked.name == self.loses:
+            self._server.cut(connection)
+        else:
+            super()._answer(connection, asked, *rest)
 
     def _waits_for(self, function: str) -> bool:
         waiting = [connection.waits_for for connection in self._server.connections]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 from tests.plugins.by_hand import (
@@ -58,30 +57,27 @@ def lift(emulator: Emulated) -> None:
     emulator.rig.switch_feedback(emulator.clock.now_s(), on=False)
 
 
-def calls(made: Bench, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return the list of called functions that change something, which grows with each."""
-    plain, called = made.emulator._answer, list[str]()
+def calls(made: Bench) -> Callable[[], list[str]]:
+    """Return a function that returns the functions called since now that change something."""
 
-    def answer(connection: Any, asked: Any, *rest: Any) -> None:
-        if asked.name.endswith(ACTS):
-            called.append(asked.name)
-        plain(connection, asked, *rest)
+    def acts_asked() -> list[str]:
+        return [name for of_port in made.emulator.asked.values() for name in of_port if name.endswith(ACTS)]
 
-    monkeypatch.setattr(made.emulator, "_answer", answer)
-    return called
+    before = len(acts_asked())
+    return lambda: acts_asked()[before:]
 
 
-def test_stopped_scan_is_an_act_by_hand_and_nothing_follows_it(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stopped_scan_is_an_act_by_hand_and_nothing_follows_it(bench: Make) -> None:
     made = bench()
     peer = slow_scan(made)
-    called = calls(made, monkeypatch)
+    called = calls(made)
     call(made, "Scan.Action", 1, 0)
     received = peer.until(FREE)
     assert states(received) == ["INTERRUPTED", "FREE"]
     assert acts(received) == [PanelAct.STOP]
     (act,) = (one for one in received if isinstance(one, ActByHand))
     assert "of its 8 lines were not scanned" in act.evidence
-    assert called == []
+    assert called() == []
 
 
 def test_stop_by_request_is_no_act_by_hand(bench: Make) -> None:
@@ -96,12 +92,12 @@ def test_shadow_leaves_a_scan_in_the_air_to_the_person(bench: Make, monkeypatch:
     monkeypatch.setattr(made, "translator", "afspm.plugins.nanonis.shadow.NanonisShadow")
     peer = made.start()
     peer.until(FREE)
-    called = calls(made, monkeypatch)
+    called = calls(made)
     made.strike("safe-tip")
     made.until_logged("Nanonis' safe tip withdrew the tip")
     call(made, "Scan.Action", 0, 1)
     made.until_logged("a run would have stopped the scan")
-    assert called == []
+    assert called() == []
     call(made, "Scan.Action", 1, 0)
     assert not scans(peer.until(FREE))
 
@@ -120,10 +116,10 @@ def test_scan_ended_by_the_safe_tip_is_no_act_by_hand(bench: Make) -> None:
     assert "by hand" not in made.log_text()
 
 
-def test_tip_withdrawn_in_a_scan_ends_it_and_no_other_begins(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tip_withdrawn_in_a_scan_ends_it_and_no_other_begins(bench: Make) -> None:
     made = bench()
     peer = slow_scan(made)
-    called = calls(made, monkeypatch)
+    called = calls(made)
     call(made, "ZCtrl.Withdraw", 0, -1)
     received = until_act(peer) + peer.until(FREE)
     assert states(received) == ["INTERRUPTED", "FREE"]
@@ -131,7 +127,7 @@ def test_tip_withdrawn_in_a_scan_ends_it_and_no_other_begins(bench: Make, monkey
     refused = peer.act(names.START_SCAN)
     assert refused.code == ControlResponse.NOT_FREE
     assert "approach at the panel" in refused.reason
-    assert called == []
+    assert called() == []
     call(made, "ZCtrl.OnOffSet", 1)
     peer.until(lambda one: getattr(one, "engaged", False))
     assert peer.act(names.START_SCAN).ok

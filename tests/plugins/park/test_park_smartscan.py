@@ -15,7 +15,7 @@ from fake_clock import FakeClock
 
 from afspm.basics import ExperimentClock, InvalidValue
 from afspm.emulation import Faults, InstrumentBusy, ScriptFailed, SimulatedInstrument
-from afspm.plugins.park.emulator import ParkEmulator, engine
+from afspm.plugins.park.emulator import ParkEmulator
 from afspm.plugins.park.emulator.engine import LONGEST_S, MOST_ALONE, Script, Wait
 from afspm.plugins.park.emulator.smartscan import SmartScanProgram
 
@@ -248,18 +248,17 @@ def test_value_of_a_slow_call_returns_to_the_script(smartscan: SmartScan) -> Non
     assert run_on(script) == ("pA", "pA")
 
 
-def test_computing_script_does_not_block_others(smartscan: SmartScan, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(engine, "_AT_ONCE_S", 0.01)
-    script = Script("let sum = 0; for (let i = 0; i < 3e6; i++) { sum += i; } 5", smartscan.names, smartscan.ask)
+def test_computing_script_does_not_block_others(smartscan: SmartScan) -> None:
+    script = Script(
+        "let sum = 0; for (let i = 0; i < 3e6; i++) { sum += i; } 5", smartscan.names, smartscan.ask, at_once_s=0.01
+    )
     assert script.step() is None
     assert 0.0 < script.computes_for_s < LONGEST_S
     assert run_on(script) == (5, "5")
 
 
-def test_endless_script_is_ended(smartscan: SmartScan, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(engine, "_AT_ONCE_S", 0.01)
-    monkeypatch.setattr(engine, "LONGEST_S", 0.0)
-    script = Script("for (let i = 0; i < 3e6; i++) {} 5", smartscan.names, smartscan.ask)
+def test_endless_script_is_ended(smartscan: SmartScan) -> None:
+    script = Script("for (let i = 0; i < 3e6; i++) {} 5", smartscan.names, smartscan.ask, at_once_s=0.01, longest_s=0.0)
     with pytest.raises(ScriptFailed, match="does not come to an end"):
         run_on(script)
 
@@ -324,9 +323,8 @@ def test_object_is_not_replaced_by_a_simple_value(smartscan: SmartScan, assigned
 LOOP = "while (true) { try { spm.zscanner.pos; } catch (e) {} }"
 
 
-def test_looping_script_takes_turns_with_others(smartscan: SmartScan, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(engine, "_AT_ONCE_S", 0.01)
-    script = Script(LOOP, smartscan.names, smartscan.ask)
+def test_looping_script_takes_turns_with_others(smartscan: SmartScan) -> None:
+    script = Script(LOOP, smartscan.names, smartscan.ask, at_once_s=0.01)
     assert script.step() is None
     assert script.step() is None
     script.end()

@@ -7,7 +7,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -32,16 +32,18 @@ sys.exit(3)
 """
 
 
+Measure = Callable[..., int]
+
+
 @pytest.fixture
-def measurements(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Measurement]:
-    """Measurements of the test alone, with a landed file and a folder of its own."""
-    made: dict[str, Measurement] = {}
-    monkeypatch.setattr(program, "MODULES", ())
-    monkeypatch.setattr(program, "MEASUREMENTS", made)
-    monkeypatch.setattr(landed.read, "__defaults__", (tmp_path / "landed.json",))
-    monkeypatch.setattr(landed.write, "__defaults__", (tmp_path / "landed.json",))
+def measure(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Measure:
+    """Run the benchmark with measurements of the test alone, a landed file and a folder of its own."""
     monkeypatch.chdir(tmp_path)
-    return made
+
+    def run(*arguments: str, **measurements: Measurement) -> int:
+        return program.main([*arguments], (), measurements, tmp_path / "landed.json")
+
+    return run
 
 
 def fast() -> Iterator[Row]:
@@ -55,28 +57,26 @@ def blind() -> Iterator[Row]:
 
 
 def test_landed_ratio_stands_beside_the_next_run(
-    measurements: dict[str, Measurement], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    measure: Measure, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    measurements["fast"] = fast
-    assert program.main(["--land"]) == 0
+    assert measure("--land", fast=fast) == 0
     assert json.loads((tmp_path / "landed.json").read_text(encoding="utf-8")) == {"fast": {"round trip": 3.0}}
     capsys.readouterr()
-    assert program.main([]) == 0
+    assert measure(fast=fast) == 0
     header, row, idle = (line.split() for line in capsys.readouterr().out.splitlines())
     assert header == ["ours", "bare", "ratio", "landed", "target"]
     assert row == ["round", "trip", "[µs]", "300", "100", "3.00", "3.00", "<=", "4"]
     assert idle == ["idle", "[%]", "1", "1.00", "<=", "2"]  # an absolute value of another computer says nothing
 
 
-def test_landing_some_measurements_keeps_the_others(measurements: dict[str, Measurement], tmp_path: Path) -> None:
+def test_landing_some_measurements_keeps_the_others(measure: Measure, tmp_path: Path) -> None:
     (tmp_path / "landed.json").write_text('{"slow": {"way": 2.0}, "fast": {"gone": 1.0}}', encoding="utf-8")
-    measurements["fast"] = fast
-    program.main(["--land", "fast"])
-    assert landed.read() == {"fast": {"round trip": 3.0}, "slow": {"way": 2.0}}
+    measure("--land", "fast", fast=fast)
+    assert landed.read(tmp_path / "landed.json") == {"fast": {"round trip": 3.0}, "slow": {"way": 2.0}}
 
 
 def test_missing_program_is_named_with_its_rows_and_the_others_go_on(
-    measurements: dict[str, Measurement], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    measure: Measure, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "landed.json").write_text('{"blind": {"a scan on the page": 2.0}}', encoding="utf-8")
 
@@ -84,13 +84,12 @@ def test_missing_program_is_named_with_its_rows_and_the_others_go_on(
         importlib.import_module("no_such_package_anywhere")
         yield Row("never", "s", 1.0, None, 1.0)
 
-    measurements.update(blind=blind, unpackaged=unpackaged, fast=fast)
-    assert program.main(["--land"]) == 0
+    assert measure("--land", blind=blind, unpackaged=unpackaged, fast=fast) == 0
     out = capsys.readouterr().out
     assert "NOT MEASURED: no chromium is found; apt install chromium\n  a scan on the page\n" in out
     assert "not measured: unpackaged: no_such_package_anywhere is not installed; run `python tools/bootstrap.py" in out
     assert "round trip [µs]" in out
-    assert landed.read() == {"blind": {"a scan on the page": 2.0}, "fast": {"round trip": 3.0}}
+    assert landed.read(tmp_path / "landed.json") == {"blind": {"a scan on the page": 2.0}, "fast": {"round trip": 3.0}}
     written = json.loads(Path("build/bench.json").read_text(encoding="utf-8"))
     assert (
         written[0] == Missing("blind", "no chromium is found; apt install chromium", ("a scan on the page",)).to_json()
@@ -98,7 +97,7 @@ def test_missing_program_is_named_with_its_rows_and_the_others_go_on(
 
 
 def test_landed_rows_are_of_measurements_that_exist() -> None:
-    program._register()
+    assert program.main(["no such measurement"]) == 2  # after all are registered
     assert landed.read().keys() <= MEASUREMENTS.keys()
 
 

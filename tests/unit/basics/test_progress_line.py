@@ -8,7 +8,6 @@ import threading
 import pytest
 from deadlines import DEADLINE_S
 
-from afspm.basics import progress_line
 from afspm.basics.progress_line import ProgressLine
 
 
@@ -32,11 +31,9 @@ class DrawnTerminal(io.StringIO):
             assert self.changed.wait_for(lambda: text in self.getvalue(), timeout=DEADLINE_S)
 
 
-def test_line_shows_the_step_and_is_erased_around_other_text(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(progress_line, "AFTER_S", 0.0)
-    monkeypatch.setattr(progress_line, "EVERY_S", 0.0)
+def test_line_shows_the_step_and_is_erased_around_other_text() -> None:
     terminal = DrawnTerminal()
-    with ProgressLine("writing gwy", stream=terminal) as line:
+    with ProgressLine("writing gwy", stream=terminal, after_s=0.0, every_s=0.0) as line:
         line.step("scan 3 of 26")
         terminal.wait_for("writing gwy · scan 3 of 26 · ")
         line.say("left out: scan 4")
@@ -46,10 +43,9 @@ def test_line_shows_the_step_and_is_erased_around_other_text(monkeypatch: pytest
 
 
 @pytest.mark.parametrize("quiet", [False, True])
-def test_nothing_is_drawn_if_quiet_or_without_a_terminal(quiet: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(progress_line, "AFTER_S", 0.0)
+def test_nothing_is_drawn_if_quiet_or_without_a_terminal(quiet: bool) -> None:
     stream = DrawnTerminal() if quiet else io.StringIO()
-    with ProgressLine("writing gwy", quiet=quiet, stream=stream) as line:
+    with ProgressLine("writing gwy", quiet=quiet, stream=stream, after_s=0.0) as line:
         assert "progress" not in {thread.name for thread in threading.enumerate()}
         line.say("left out: scan 4")
     assert stream.getvalue() == "left out: scan 4\n"

@@ -8,8 +8,8 @@ from afspm.basics.errors import ConfigError
 from afspm.basics.requirements import imports_of_extra, require
 
 
-class Needy:
-    requires: object = ()
+def needy(requires: object) -> type:
+    return type("Needy", (), {"requires": requires})
 
 
 INSTALLED = {"afspm": "0.1.0", "numpy": "2.1", "nicegui": "2.9"}
@@ -44,12 +44,9 @@ def _packages(monkeypatch: pytest.MonkeyPatch) -> None:
         (("numpy", "torch", "jax"), "torch, jax", 'pip install "torch" "jax"'),
     ],
 )
-def test_missing_packages_are_named_with_the_install_command(
-    requires: object, packages: str, command: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(Needy, "requires", requires)
+def test_missing_packages_are_named_with_the_install_command(requires: object, packages: str, command: str) -> None:
     with pytest.raises(ConfigError) as refused:
-        require(Needy)
+        require(needy(requires))
     assert (refused.value.what, refused.value.hint) == (
         f"Needy needs packages that are not installed: {packages}",
         command,
@@ -65,13 +62,11 @@ def test_missing_package_of_an_extra_is_named_with_the_install_command() -> None
 
 
 @pytest.mark.parametrize("requires", [(), ("numpy>=1.26",), ("afspm",)])
-def test_installed_packages_are_accepted(requires: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Needy, "requires", requires)
-    require(Needy)
+def test_installed_packages_are_accepted(requires: object) -> None:
+    require(needy(requires))
     require(None)
 
 
-def test_invalid_requirement_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Needy, "requires", ("two words",))
+def test_invalid_requirement_is_refused() -> None:
     with pytest.raises(ConfigError, match="'two words' is not a requirement"):
-        require(Needy)
+        require(needy(("two words",)))

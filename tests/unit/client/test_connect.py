@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -51,6 +51,17 @@ def run_folder(runs: Path, name: str, origin_s: float = 0.0) -> Path:
     return folder
 
 
+@pytest.fixture
+def joins(monkeypatch: pytest.MonkeyPatch) -> Callable[[Port], Port]:
+    """Let clients join through a port of the test."""
+
+    def through(port: Port) -> Port:
+        monkeypatch.setattr(connect, "open_port", lambda launch, clock: port)
+        return port
+
+    return through
+
+
 def test_refusal_of_a_folder_without_runs_says_how_to_start_one(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="there is no run here") as refused:
         afspm.connect(tmp_path)
@@ -80,17 +91,15 @@ def test_run_is_found_by_a_file_with_a_byte_order_mark(tmp_path: Path, monkeypat
     assert find_run(file).name == "night-1"
 
 
-def test_interrupt_while_joining_leaves_no_connection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    port = Port()
-    monkeypatch.setattr(connect, "open_port", lambda launch, clock: port)
+def test_interrupt_while_joining_leaves_no_connection(tmp_path: Path, joins: Callable[[Port], Port]) -> None:
+    port = joins(Port())
     with pytest.raises(KeyboardInterrupt):
         afspm.connect(run_folder(tmp_path, "night"))
     assert port.is_closed
 
 
-def test_unreadable_results_leave_no_connection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    port, folder = Port(ControlConnected(), CaughtUp(PUBLISHER)), run_folder(tmp_path, "night")
-    monkeypatch.setattr(connect, "open_port", lambda launch, clock: port)
+def test_unreadable_results_leave_no_connection(tmp_path: Path, joins: Callable[[Port], Port]) -> None:
+    port, folder = joins(Port(ControlConnected(), CaughtUp(PUBLISHER))), run_folder(tmp_path, "night")
     (folder / "state" / "notebook.scope.json").write_text("nonsense", encoding="utf-8")
     with pytest.raises(FileError):
         afspm.connect(folder)
@@ -98,7 +107,10 @@ def test_unreadable_results_leave_no_connection(tmp_path: Path, monkeypatch: pyt
 
 
 def test_module_that_a_run_folder_names_is_imported_only_if_the_caller_names_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path,
+    joins: Callable[[Port], Port],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """The folder, and the module with it, may come from another person."""
     folder = run_folder(tmp_path, "night")
@@ -107,7 +119,7 @@ def test_module_that_a_run_folder_names_is_imported_only_if_the_caller_names_it(
     facts = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     facts[GUEST]["messages"] = ["beside_the_run"]
     (folder / "run.json").write_text(json.dumps(facts), encoding="utf-8")
-    monkeypatch.setattr(connect, "open_port", lambda launch, clock: Port(ControlConnected(), CaughtUp(PUBLISHER)))
+    joins(Port(ControlConnected(), CaughtUp(PUBLISHER)))
     caplog.set_level("WARNING")
     connect.join(folder, "terminal:ada")  # a command such as `afspm end` reads no messages
     assert "beside_the_run" not in caplog.text

@@ -45,7 +45,7 @@ from afspm.night.night_record import (
 
 pytest.importorskip("matplotlib")
 from afspm.report import night_figure
-from afspm.report.night_figure import MOST_SHOTS, _chosen, _episodes, draw, flagged_by
+from afspm.report.night_figure import MOST_SHOTS, _chosen, _episodes, draw, figure_of, flagged_by
 
 MINUTE_NS = 60_000_000_000
 TIP = int(Problem.TIP_SHAPE_CHANGED)
@@ -249,38 +249,19 @@ def test_a_restart_loses_nothing_and_doubles_nothing(tmp_path: Path) -> None:
     assert len(times) == len(set(times)) == 3
 
 
-def test_picture_of_a_simulated_night_alone_is_marked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from matplotlib.figure import Figure
-
-    written: list[str] = []
-    text = Figure.text
-    monkeypatch.setattr(Figure, "text", lambda self, x, y, s, **k: written.append(s) or text(self, x, y, s, **k))
-    draw(night(), tmp_path / "measured.png", {})
-    assert not any(re.search("SIMULATED", s) for s in written)
-    draw(night(), tmp_path / "simulated.png", {}, simulated=True)
-    assert "SIMULATED" in written
+def test_picture_of_a_simulated_night_alone_is_marked() -> None:
+    measured, simulated = (figure_of(night(), {}, simulated=one) for one in (False, True))
+    assert not any("SIMULATED" in text.get_text() for text in measured.texts)
+    assert "SIMULATED" in [text.get_text() for text in simulated.texts]
 
 
 @pytest.mark.parametrize("far_ns", [2**62, 2**63 - 1, -(2**62)])
-def test_time_that_is_centuries_off_makes_few_ticks(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, far_ns: int
-) -> None:
-    from matplotlib.axes import Axes
-
-    ticks: list[int] = []
-    of_axes = Axes.set_xticks
-    monkeypatch.setattr(
-        Axes,
-        "set_xticks",
-        lambda self, at, *rest, **more: (
-            ticks.append(len(at)) or of_axes(self, at[:20], *[labels[:20] for labels in rest], **more)
-        ),
-    )
+def test_time_that_is_centuries_off_makes_few_ticks(far_ns: int) -> None:
     record = night()
     record.add(scan_entry(scan(far_ns), far_ns, None, "series"))
     record.add(control_entry(ControlState(holder="series", problems=(TIP,)), far_ns))
-    draw(record, tmp_path / "night.png", {TIP: "tip-shape-changed"})
-    assert max(ticks) < 20
+    figure = figure_of(record, {TIP: "tip-shape-changed"})
+    assert max(len(ax.get_xticks()) for ax in figure.axes) < 20
 
 
 def test_scan_judged_bad_is_framed_and_a_test_scan_of_the_repair_is_not() -> None:
@@ -296,15 +277,9 @@ def test_scan_judged_bad_is_framed_and_a_test_scan_of_the_repair_is_not() -> Non
     assert drifted.bad_ns() == frozenset(), "drift says nothing about the scan before it"
 
 
-def test_all_times_in_the_picture_are_times_of_day(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from matplotlib.axes import Axes
-
-    labels: list[str] = []
-    of_axes = Axes.set_xticks
-    monkeypatch.setattr(
-        Axes, "set_xticks", lambda self, at, names, **more: labels.extend(names) or of_axes(self, at, names, **more)
-    )
-    draw(night(), tmp_path / "night.png", {TIP: "tip-shape-changed"})
+def test_all_times_in_the_picture_are_times_of_day() -> None:
+    figure = figure_of(night(), {TIP: "tip-shape-changed"})
+    labels = [text for ax in figure.axes if ax.axison for label in ax.get_xticklabels() if (text := label.get_text())]
     assert len(labels) > 5
     assert all(re.fullmatch(r"\d\d:\d\d(:\d\d)?", label) for label in labels), labels
 
@@ -326,11 +301,9 @@ def test_scans_of_one_size_share_a_range_that_one_odd_scan_does_not_widen() -> N
     assert np.nanmin(record.shots[1].picture.values) == pytest.approx(low)
 
 
-def test_scale_bar_of_a_night_is_as_long_as_its_label(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    figures: list[Any] = []
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda self, *rest, **how: figures.append(self))
-    draw(night(), tmp_path / "night.png", {TIP: "tip-shape-changed"})
-    sheet = next(ax for ax in figures[0].axes if any(text.get_text().endswith("nm") for text in ax.texts))
+def test_scale_bar_of_a_night_is_as_long_as_its_label() -> None:
+    figure = figure_of(night(), {TIP: "tip-shape-changed"})
+    sheet = next(ax for ax in figure.axes if any(text.get_text().endswith("nm") for text in ax.texts))
     length = next(text.get_text() for text in sheet.texts if text.get_text().endswith("nm"))
     canvas = np.asarray(sheet.images[0].get_array())
     row = canvas[night_figure.THUMB_PX - 6, : night_figure.THUMB_PX]  # through the bar of the first picture
@@ -340,16 +313,14 @@ def test_scale_bar_of_a_night_is_as_long_as_its_label(tmp_path: Path, monkeypatc
     assert bar_px == pytest.approx(float(length.split()[0]) * 1e-9 / 1e-6 * night_figure.THUMB_PX, abs=1.0)
 
 
-def test_tile_of_a_night_has_the_proportions_of_its_region(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    figures: list[Any] = []
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda self, *rest, **how: figures.append(self))
+def test_tile_of_a_night_has_the_proportions_of_its_region() -> None:
     tall = Region((0.0, 0.0), (0.5e-6, 1e-6))
     values = np.random.default_rng(1).random((16, 128))  # few long lines, as of a fast overview
     record = NightRecord()
     record.add(control_entry(ControlState(holder="series"), 0))
     record.add(scan_entry(Scan(tall, "Height", "m", values, 0), 2 * MINUTE_NS, 0, "series"))
-    draw(record, tmp_path / "night.png", {})
-    sheet = next(ax for ax in figures[0].axes if any(text.get_text().endswith("nm") for text in ax.texts))
+    figure = figure_of(record, {})
+    sheet = next(ax for ax in figure.axes if any(text.get_text().endswith("nm") for text in ax.texts))
     side, left = night_figure.THUMB_PX, night_figure.GAP_PX // 2
     tile = np.asarray(sheet.images[0].get_array())[:side, left : left + side]
     grey = tuple(int(NEUTRAL[i : i + 2], 16) for i in (1, 3, 5))  # beside the scan

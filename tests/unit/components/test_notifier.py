@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from client_lab import FakeClock
+from deadlines import DEADLINE_S
 from typer.testing import CliRunner
 
 from afspm import model
@@ -311,11 +312,10 @@ def test_a_command_gets_the_notice(tmp_path: Path) -> None:
     ("code", "said"),
     [("import sys; sys.exit('no network')", "ended with 1: no network"), ("while True: pass", "took longer")],
 )
-def test_failing_command_is_an_error(monkeypatch: pytest.MonkeyPatch, code: str, said: str) -> None:
-    if said == "took longer":
-        monkeypatch.setattr(notifications, "TIMEOUT_S", 0.5)
+def test_failing_command_is_an_error(code: str, said: str) -> None:
+    timeout_s = 0.5 if said == "took longer" else DEADLINE_S
     with pytest.raises(NotDelivered, match=said):
-        Targets([sys.executable, "-c", code]).deliver(NOTICE, "command")
+        Targets([sys.executable, "-c", code], timeout_s=timeout_s).deliver(NOTICE, "command")
 
 
 def test_missing_program_is_an_error() -> None:

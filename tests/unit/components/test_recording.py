@@ -24,7 +24,7 @@ from afspm.basics.errors import FileError
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.launch import Launch
 from afspm.components import recorder, recording
-from afspm.components.recording import RecordWriter
+from afspm.components.recording import RecordWriter, WriterLimits
 from afspm.model import (
     ControlMode,
     ControlState,
@@ -61,7 +61,12 @@ class Bench:
         self.woken = threading.Event()
         self.writers: list[RecordWriter] = []
 
-    def writer(self, step: Callable[[], contextlib.AbstractContextManager[None]] | None = None) -> RecordWriter:
+    def writer(
+        self,
+        step: Callable[[], contextlib.AbstractContextManager[None]] | None = None,
+        open_store: Callable[[Path, RecordSettings], RecordStore] = RecordStore,
+        **limits: int,
+    ) -> RecordWriter:
         writer = RecordWriter(
             self.folder,
             self.packets,
@@ -70,6 +75,9 @@ class Bench:
             logging.getLogger("recorder"),
             step=step or contextlib.nullcontext,
             wake=self.woken.set,
+            # after a second `finish` leaves a busy writer to itself, which would write into what a test has changed
+            limits=WriterLimits(0.02, 0.02, 0.02, 0.02, 0.02, stopping_s=DEADLINE_S, **limits),
+            open_store=open_store,
         )
         self.writers.append(writer)
         writer.start()
@@ -99,11 +107,7 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    for name in ("AGAIN_S", "QUIET_S", "LOOK_S", "LONGEST_LOOK_S", "COMMIT_S"):
-        monkeypatch.setattr(recording, name, 0.02)
-    # after a second `finish` leaves a busy writer to itself, which would write into what a test has changed meanwhile
-    monkeypatch.setattr(recording, "STOPPING_S", DEADLINE_S)
+def bench(tmp_path: Path) -> Iterator[Bench]:
     made = Bench(tmp_path)
     yield made
     made.log.close()
@@ -133,10 +137,9 @@ def test_flood_of_packets_is_recorded_in_short_steps_that_follow_each_other(
         reads.append((len(found), is_in_step))
         return found
 
-    monkeypatch.setattr(recording, "MOST_AT_ONCE", 10)
     monkeypatch.setattr(LogReader, "read", read)
     bench.publish(*map(control, range(1, 26)))
-    writer = bench.writer(activity.step)
+    writer = bench.writer(activity.step, most_at_once=10)
     writer.finish(ended=True)
     # a heartbeat between two batches shows a recorder at work, which is not asked to end
     assert reads[:4] == [(10, False), (10, True), (5, True), (0, True)]
@@ -219,11 +222,11 @@ def test_committed_packets_are_on_the_disk(
 
 
 def test_full_disk_is_logged_once_and_all_is_recorded_once_there_is_room(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
-    disk = _Disk(monkeypatch)
-    writer = bench.writer()
+    disk = _Disk()
+    writer = bench.writer(open_store=disk.open_store)
     _until(lambda: (bench.folder / JOURNAL_FILE).exists())
     disk.is_full = True
     for time_ns in (1, 2):
@@ -240,12 +243,11 @@ def test_full_disk_is_logged_once_and_all_is_recorded_once_there_is_room(
 
 
 def test_packets_dropped_while_the_disk_was_full_are_requested_again(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    bench: Bench,
 ) -> None:
-    monkeypatch.setattr(recording, "MOST_BYTES", 200)
-    disk = _Disk(monkeypatch)
+    disk = _Disk()
     disk.is_full = True
-    writer = bench.writer()
+    writer = bench.writer(open_store=disk.open_store, most_bytes=200)
     writer.put(control(1), "tcp://another")
     _until(lambda: disk.refused > 0)
     packets = [control(time_ns) for time_ns in range(1, 30)]
@@ -295,12 +297,8 @@ def test_journal_damaged_further_in_is_moved_aside_too(
     assert again.wants_replay()
 
 
-def test_error_that_ends_the_writing_is_raised_by_check(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: Any) -> None:
-        raise RuntimeError("a mistake of ours")
-
-    monkeypatch.setattr(RecordStore, "take", broken)
-    writer = bench.writer()
+def test_error_that_ends_the_writing_is_raised_by_check(bench: Bench) -> None:
+    writer = bench.writer(open_store=_BrokenStore)
     bench.publish(control(1))
     assert bench.woken.wait(DEADLINE_S)
     with pytest.raises(RuntimeError, match="mistake of ours"):
@@ -381,18 +379,29 @@ def test_reports_after_the_recorder_has_ended_are_recorded_unless_more_is_missin
 class _Disk:
     """A disk that may be full."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self) -> None:
         self.is_full = False
         self.refused = 0
-        take = RecordStore.take
 
-        def taken(store: RecordStore, packets: Any) -> None:
-            if self.is_full:
-                self.refused += 1
-                raise OSError(errno.ENOSPC, "No space left on device")
-            take(store, packets)
+    def open_store(self, folder: Path, settings: RecordSettings) -> RecordStore:
+        return _StoreOnDisk(self, folder, settings)
 
-        monkeypatch.setattr(RecordStore, "take", taken)
+
+class _StoreOnDisk(RecordStore):
+    def __init__(self, disk: _Disk, folder: Path, settings: RecordSettings) -> None:
+        self._disk = disk
+        super().__init__(folder, settings)
+
+    def take(self, packets: Any) -> None:
+        if self._disk.is_full:
+            self._disk.refused += 1
+            raise OSError(errno.ENOSPC, "No space left on device")
+        super().take(packets)
+
+
+class _BrokenStore(RecordStore):
+    def take(self, packets: Any) -> None:
+        raise RuntimeError("a mistake of ours")
 
 
 def _all_times(bench: Bench) -> list[int]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import sqlite3
 import sys
-import tempfile
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path, PureWindowsPath
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from record_lab import ABOUT, Night
+from temporary_folder import use_temporary_folder
 
 import afspm
 from afspm import wire
@@ -62,7 +62,7 @@ def test_copy_of_a_read_only_journal_is_removed_when_closed_or_collected(
     store.take(night.whole_scan(1))
     copies = tmp_path / "copies"
     copies.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(copies))
+    use_temporary_folder(copies, monkeypatch)
     opened = sqlite3.connect
 
     def connect(name: Any, **settings: Any) -> Any:
@@ -115,10 +115,10 @@ def test_ended_journal_is_one_file_and_stays_one_when_read(night: Night, store: 
 def test_reader_is_not_disturbed_by_the_end_of_the_run(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take(night.whole_scan(1))
     with afspm.open_run(tmp_path) as run:
-        rows = run._journal.execute("SELECT * FROM packets")
-        rows.fetchone()  # in the middle of it
+        packets = iter(run.packets())
+        next(packets)  # in the middle of it
         store.settle()
-        assert len(rows.fetchall()) == 3
+        assert len(list(packets)) == 3
         assert len(run.scans) == 1
 
 

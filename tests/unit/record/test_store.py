@@ -7,6 +7,7 @@ import json
 import os
 import sqlite3
 import sys
+from collections.abc import Iterator
 from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -474,16 +475,18 @@ def test_process_change_is_found_without_a_search_of_the_whole_night(store: Reco
     assert "processes_by_name" in plan
 
 
-def test_only_one_transaction_is_written_at_a_time_and_readers_never_wait(
+def test_packets_taken_together_are_one_transaction_and_readers_never_wait(
     night: Night, store: RecordStore, tmp_path: Path
 ) -> None:
     run = afspm.open_run(tmp_path)
-    with store._all_or_nothing():
-        store._take(*night.control())
+
+    def packets() -> Iterator[tuple[Packet, str]]:
+        yield night.control()
         assert len(run.control) == 0
+        yield night.state(ScopeState.FREE)
+
+    store.take(packets())
     assert len(run.control) == 1
-    with pytest.raises(sqlite3.OperationalError):
-        run._journal.execute("DELETE FROM packets")
 
 
 def test_journal_is_synced_before_its_write_ahead_log_is_restarted(store: RecordStore) -> None:

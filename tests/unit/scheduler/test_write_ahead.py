@@ -6,8 +6,9 @@ import errno
 import logging
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 from deadlines import DEADLINE_S
@@ -17,7 +18,7 @@ from afspm.model import LoggedPacket, Packet
 from afspm.scheduler.saved_state import SavedState
 from afspm.scheduler.write_ahead import StateFile, WriteAhead
 from afspm.storage import atomic, disk, packet_log
-from afspm.storage.disk import SYNCER
+from afspm.storage.disk import SYNCER, DiskThread
 from afspm.storage.packet_log import PacketLog, cached_packets, commit, expect_recorder, logged_packets
 
 STATE = SavedState(last_ns=7)
@@ -28,30 +29,64 @@ def own(time_ns: int, envelope: str = "JournalEntries", size: int = 1) -> Logged
     return LoggedPacket(Packet(envelope, b"x" * size, time_ns), None, 1)
 
 
+class FaultyStateFile(StateFile):
+    """A state file on a disk that does `before_save` first."""
+
+    before_save: Callable[[], object] = staticmethod(list)
+
+    def save(self, state: SavedState) -> None:
+        self.before_save()
+        super().save(state)
+
+
+class FaultyLog(PacketLog):
+    """A packet log on a disk that does `before_append` first."""
+
+    before_append: Callable[[], object] = staticmethod(list)
+
+    def append(self, entry: LoggedPacket) -> None:
+        self.before_append()
+        super().append(entry)
+
+
 class Bench:
     """A scheduler's disk, with the write-ahead log and the cache."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, most_bytes: int = disk.MOST_BYTES, **limits: int) -> None:
         self.packets = folder / "packets"
         self.cached: list[LoggedPacket] = []
-        self.state = StateFile(folder / "scheduler.json", logging.getLogger("scheduler"))
-        self.writes = WriteAhead(
-            self.state, PacketLog(self.packets), lambda: list(self.cached), logging.getLogger("scheduler")
-        )
+        self.state = FaultyStateFile(folder / "scheduler.json", logging.getLogger("scheduler"))
+        self.log = FaultyLog(self.packets, **limits)
+        self.disk = DiskThread(most_bytes=most_bytes)
+        logger = logging.getLogger("scheduler")
+        self.writes = WriteAhead(self.state, self.log, lambda: list(self.cached), logger, self.disk)
 
     def publish(self, *entries: LoggedPacket) -> None:
         self.cached += entries
         self.writes.write(None, entries)
+
+    def wait_for_disk(self) -> None:
+        assert self.disk.submit(lambda: None).done.acquire(timeout=DEADLINE_S)
 
     def logged(self) -> list[int]:
         return [entry.packet.time_ns or 0 for entry in logged_packets(self.packets)]
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    made = Bench(tmp_path)
-    yield made
-    made.writes.close()
+def make_bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
+    with ExitStack() as stack:
+
+        def make(**limits: int) -> Bench:
+            made = Bench(tmp_path, **limits)
+            stack.callback(made.writes.close)
+            return made
+
+        yield make
+
+
+@pytest.fixture
+def bench(make_bench: Callable[..., Bench]) -> Bench:
+    return make_bench()
 
 
 def test_written_packets_are_in_the_log_at_once(bench: Bench) -> None:
@@ -72,32 +107,21 @@ def test_missing_state_is_logged_unless_it_is_the_first(bench: Bench, caplog: py
     assert "no problem is flagged" in caplog.text
 
 
-class FullDisk:
-    """A log that takes no packets while it `is_full`."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.is_full = True
-        append = PacketLog.append
-
-        def appended(log: PacketLog, entry: LoggedPacket) -> None:
-            if self.is_full:
-                raise OSError(errno.ENOSPC, "No space left on device")
-            append(log, entry)
-
-        monkeypatch.setattr(PacketLog, "append", appended)
+def full() -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def test_packets_that_found_no_room_are_written_before_later_ones(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
     bench.publish(own(1))
-    full = FullDisk(monkeypatch)
+    bench.log.before_append = full
     bench.publish(own(2), own(3))
     bench.publish(own(4))
     del bench.cached[1]  # it is superseded meanwhile
     assert bench.logged() == [1]
-    full.is_full = False
+    bench.log.before_append = list
     bench.publish(own(5))
     bench.publish(own(6))
     assert bench.logged() == [1, 3, 4, 5, 6]
@@ -109,13 +133,7 @@ def test_hanging_disk_is_not_waited_for_and_catches_up(
 ) -> None:
     caplog.set_level(logging.INFO)
     answers = threading.Event()
-    append = PacketLog.append
-
-    def hangs(log: PacketLog, entry: LoggedPacket) -> None:
-        answers.wait(DEADLINE_S)
-        append(log, entry)
-
-    monkeypatch.setattr(PacketLog, "append", hangs)
+    bench.log.before_append = lambda: answers.wait(DEADLINE_S)
     monkeypatch.setattr(atomic, "SLOW_S", 0.0)
     clock = ExperimentClock.real()
     began_s = clock.monotonic_s()
@@ -128,27 +146,22 @@ def test_hanging_disk_is_not_waited_for_and_catches_up(
     assert [record.levelname for record in caplog.records if "has not answered" in record.getMessage()] == ["WARNING"]
 
 
-def test_packets_beyond_the_backlog_are_written_as_far_as_cached(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_packets_beyond_the_backlog_are_written_as_far_as_cached(make_bench: Callable[..., Bench]) -> None:
+    bench = make_bench(most_bytes=1000)
     answers = threading.Event()
-    append = PacketLog.append
-
-    def hangs(log: PacketLog, entry: LoggedPacket) -> None:
-        answers.wait(DEADLINE_S)
-        append(log, entry)
-
-    monkeypatch.setattr(PacketLog, "append", hangs)
-    bench.writes._disk._most_bytes = 1000
+    bench.log.before_append = lambda: answers.wait(DEADLINE_S)
     for time_ns in range(1, 8):
         bench.publish(own(time_ns, size=300))
     answers.set()
-    assert bench.writes._disk.submit(lambda: None).done.acquire(timeout=DEADLINE_S)
+    bench.wait_for_disk()
     bench.publish(own(8))
     assert bench.logged() == list(range(1, 9))
 
 
-def test_cached_packets_survive_the_cleaning_of_the_log(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(packet_log, "SEGMENT_BYTES", 1000)
-    monkeypatch.setattr(packet_log, "CAPACITY_BYTES", 3000)
+def test_cached_packets_survive_the_cleaning_of_the_log(
+    make_bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = make_bench(segment_bytes=1000, capacity_bytes=3000)
     monkeypatch.setattr(disk, "sync_data", lambda *_: None)  # a busy disk would hold the cleaning up
     bench.publish(own(1, "ControlState"))
     for time_ns in range(2, 100):
@@ -163,17 +176,14 @@ def test_cached_packets_survive_the_cleaning_of_the_log(bench: Bench, monkeypatc
 
 
 def test_recorder_that_falls_behind_is_logged(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    make_bench: Callable[..., Bench], caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
-    monkeypatch.setattr(packet_log, "SEGMENT_BYTES", 1000)
-    monkeypatch.setattr(packet_log, "CAPACITY_BYTES", 2000)
+    bench = make_bench(segment_bytes=1000, capacity_bytes=2000, most_unrecorded_bytes=2000)
     expect_recorder(bench.packets)
-    log = PacketLog(bench.packets, most_unrecorded_bytes=2000)
-    monkeypatch.setattr(bench.writes, "_log", log)
     for time_ns in range(1, 40):
         bench.writes.write(None, [own(time_ns, size=300)])
-    assert bench.writes._disk.submit(lambda: None).done.acquire(timeout=DEADLINE_S)
+    bench.wait_for_disk()
     assert "does not keep up" in caplog.text
     commit(bench.packets, packet_log.Position(10**6, 0))
     for time_ns in range(40, 60):
@@ -183,20 +193,16 @@ def test_recorder_that_falls_behind_is_logged(
 
 
 @pytest.mark.parametrize("steps", range(3))
-def test_packet_is_logged_after_the_state_it_reports(bench: Bench, monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
+def test_packet_is_logged_after_the_state_it_reports(bench: Bench, steps: int) -> None:
     done: list[str] = []
 
-    def until_cut(name: str, do: Callable[..., Any]) -> Callable[..., Any]:
-        def step(*arguments: Any, **named: Any) -> Any:
-            if len(done) == steps:
-                raise OSError("the power is gone")
-            done.append(name)
-            return do(*arguments, **named)
+    def until_cut(name: str) -> None:
+        if len(done) == steps:
+            raise OSError("the power is gone")
+        done.append(name)
 
-        return step
-
-    monkeypatch.setattr(StateFile, "save", until_cut("state", StateFile.save))
-    monkeypatch.setattr(PacketLog, "append", until_cut("packet", PacketLog.append))
+    bench.state.before_save = partial(until_cut, "state")
+    bench.log.before_append = partial(until_cut, "packet")
     bench.writes.write(STATE, [own(1)])
     assert done == ["state", "packet"][:steps]
     assert bool(bench.state.load()) == (steps > 0)

@@ -92,22 +92,16 @@ def test_single_read_has_a_time_limit() -> None:
     hanging.goes_on.set()
 
 
-@pytest.fixture
-def synced(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[int]:
-    """Return the inodes of the test's synced files; threads of earlier tests may sync others."""
-    found: list[int] = []
+class NotingSyncer(Syncer):
+    """A syncer that notes the inodes of the files in place of a sync."""
 
-    def note(descriptor: int) -> None:
-        number = os.fstat(descriptor).st_ino
-        if number in {path.stat().st_ino for path in (tmp_path, *tmp_path.iterdir())}:
-            found.append(number)
-
-    monkeypatch.setattr(disk, "sync_data", note)
-    return found
+    def __init__(self, period_s: float) -> None:
+        self.synced: list[int] = []
+        super().__init__(period_s, lambda descriptor: self.synced.append(os.fstat(descriptor).st_ino))
 
 
-def test_written_data_are_synced_a_moment_later_though_the_file_was_closed(tmp_path: Path, synced: list[int]) -> None:
-    syncer, done = Syncer(period_s=0.01), threading.Event()
+def test_written_data_are_synced_a_moment_later_though_the_file_was_closed(tmp_path: Path) -> None:
+    syncer, done = NotingSyncer(period_s=0.01), threading.Event()
     for name in ("a", "b"):
         with (tmp_path / name).open("wb", buffering=0) as file:
             file.write(b"x")
@@ -115,24 +109,27 @@ def test_written_data_are_synced_a_moment_later_though_the_file_was_closed(tmp_p
     syncer.folder_soon(tmp_path)
     folder = () if sys.platform == "win32" else (tmp_path,)  # Windows syncs no folders
     wanted = {path.stat().st_ino for path in (tmp_path / "a", tmp_path / "b", *folder)}
-    while set(synced) != wanted and not done.wait(0.01):
+    while set(syncer.synced) != wanted and not done.wait(0.01):
         pass
 
 
-def test_sync_now_waits_for_the_disk(tmp_path: Path, synced: list[int]) -> None:
-    syncer = Syncer(period_s=100.0)
+def test_sync_now_waits_for_the_disk(tmp_path: Path) -> None:
+    syncer = NotingSyncer(period_s=100.0)
     syncer.now(DEADLINE_S)  # nothing was written
     with (tmp_path / "a").open("wb", buffering=0) as file:
         file.write(b"x")
         syncer.soon(file.fileno())
         syncer.now(DEADLINE_S)
-        assert synced == [os.fstat(file.fileno()).st_ino]
+        assert syncer.synced == [os.fstat(file.fileno()).st_ino]
 
 
-def test_failing_sync_is_logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sync_that_hangs_is_not_waited_for(tmp_path: Path) -> None:
     goes_on = threading.Event()
-    monkeypatch.setattr(disk, "sync_data", lambda descriptor: goes_on.wait(DEADLINE_S))
-    syncer = Syncer(period_s=100.0)
+
+    def hangs(descriptor: int) -> None:
+        goes_on.wait(DEADLINE_S)
+
+    syncer = Syncer(100.0, hangs)
     with (tmp_path / "a").open("wb", buffering=0) as file:
         syncer.soon(file.fileno())
         with pytest.raises(DiskTimeout):
@@ -141,24 +138,22 @@ def test_failing_sync_is_logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_sync_that_the_disk_refuses_is_raised_to_the_next_that_waits_and_logged_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    plainly = disk.sync_data
+    refuses = True
 
-    def refuse(descriptor: int) -> None:
-        if os.path.samestat(os.fstat(descriptor), (tmp_path / "a").stat()):
+    def sync(descriptor: int) -> None:
+        if refuses:
             raise OSError(errno.EIO, "Input/output error")
-        plainly(descriptor)  # of an earlier test: the syncer of this process may still have work
 
     caplog.set_level("INFO")
-    syncer = Syncer(period_s=0.0)
+    syncer = Syncer(0.0, sync)
     with (tmp_path / "a").open("wb", buffering=0) as file:
-        with monkeypatch.context() as refusing:
-            refusing.setattr(disk, "sync_data", refuse)
-            for _ in range(3):
-                syncer.soon(file.fileno())
-                with pytest.raises(OSError, match="Input/output error"):
-                    syncer.now(DEADLINE_S)
+        for _ in range(3):
+            syncer.soon(file.fileno())
+            with pytest.raises(OSError, match="Input/output error"):
+                syncer.now(DEADLINE_S)
+        refuses = False
         syncer.now(DEADLINE_S)  # nothing was written since
         syncer.soon(file.fileno())
         syncer.now(DEADLINE_S)
@@ -168,8 +163,7 @@ def test_sync_that_the_disk_refuses_is_raised_to_the_next_that_waits_and_logged_
     ]
 
 
-def test_disk_is_full_when_no_scan_has_room_on_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_disk_is_full_when_no_scan_has_room_on_it(tmp_path: Path) -> None:
     assert not disk.is_full(tmp_path)
     assert not disk.is_full(tmp_path / "gone")
-    monkeypatch.setattr(disk, "FULL_BYTES", 1 << 62)
-    assert disk.is_full(tmp_path)
+    assert disk.is_full(tmp_path, least_free=1 << 62)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -66,10 +67,9 @@ def logging(folder: Path) -> Iterator[Logging]:
 
 
 @pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Limit the log to four segments of a few packets."""
-    monkeypatch.setattr(packet_log, "SEGMENT_BYTES", SMALL_SEGMENT)
-    monkeypatch.setattr(packet_log, "CAPACITY_BYTES", 4 * SMALL_SEGMENT)
+def small(logging: Logging) -> Logging:
+    """Open a log of four segments of a few packets."""
+    return partial(logging, segment_bytes=SMALL_SEGMENT, capacity_bytes=4 * SMALL_SEGMENT)
 
 
 def test_packets_are_read_in_the_order_of_appending(logging: Logging, folder: Path) -> None:
@@ -131,8 +131,8 @@ def test_the_cache_is_rebuilt_with_as_many_of_each_envelope_as_it_held(logging: 
     assert [one.packet.time_ns for one in cached_packets(folder)] == [9, 107, 108, 109]
 
 
-def test_cached_packets_of_any_age_stay_in_the_log(logging: Logging, folder: Path, small: None) -> None:
-    log = logging()
+def test_cached_packets_of_any_age_stay_in_the_log(small: Logging, folder: Path) -> None:
+    log = small()
     old = [entry(1, 40, "ScanParameters2d"), entry(2, 40, "ControlState")]
     for one in old:
         log.append(one)
@@ -145,9 +145,9 @@ def test_cached_packets_of_any_age_stay_in_the_log(logging: Logging, folder: Pat
 
 
 def test_carried_packets_are_synced_before_the_old_copy_is_freed(
-    logging: Logging, folder: Path, small: None, monkeypatch: pytest.MonkeyPatch
+    small: Logging, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    log = logging()
+    log = small()
     log.append(entry(1, 40, "ControlState"))
     for time_ns in range(2, 40):
         log.append(entry(time_ns, 40))
@@ -165,9 +165,9 @@ def test_carried_packets_are_synced_before_the_old_copy_is_freed(
 # --- how much is kept ---
 
 
-def test_segments_that_are_not_recorded_yet_are_kept(logging: Logging, folder: Path, small: None) -> None:
+def test_segments_that_are_not_recorded_yet_are_kept(small: Logging, folder: Path) -> None:
     expect_recorder(folder)
-    log = logging()
+    log = small()
     for time_ns in range(1, 60):
         log.append(entry(time_ns, 40))
         assert log.clean([])
@@ -182,9 +182,9 @@ def test_segments_that_are_not_recorded_yet_are_kept(logging: Logging, folder: P
     assert kept[0] > 20
 
 
-def test_recorded_segments_are_overwritten(logging: Logging, folder: Path, small: None) -> None:
+def test_recorded_segments_are_overwritten(small: Logging, folder: Path) -> None:
     expect_recorder(folder)
-    log = logging()
+    log = small()
     for time_ns in range(1, 200):
         log.append(entry(time_ns, 40))
         commit_all(folder)
@@ -194,14 +194,14 @@ def test_recorded_segments_are_overwritten(logging: Logging, folder: Path, small
     assert kept == list(range(kept[0], 200)), "what was in the files before is not found again"
 
 
-def test_new_life_ignores_remains_in_an_overwritten_segment(logging: Logging, folder: Path, small: None) -> None:
-    log = logging()
+def test_new_life_ignores_remains_in_an_overwritten_segment(small: Logging, folder: Path) -> None:
+    log = small()
     for time_ns in range(1, 60):
         log.append(entry(time_ns, 40))
         log.clean([])
     log.close()
     position = commit_all(folder)
-    other = logging()
+    other = small()
     for time_ns in range(60, 90):
         other.append(entry(time_ns, 30))
         other.clean([])
@@ -211,11 +211,9 @@ def test_new_life_ignores_remains_in_an_overwritten_segment(logging: Logging, fo
         assert packet.payload == entry(packet.time_ns or 0, len(packet.payload)).packet.payload
 
 
-def test_oldest_segment_is_given_up_and_reported_if_the_recorder_is_too_late(
-    logging: Logging, folder: Path, small: None
-) -> None:
+def test_oldest_segment_is_given_up_and_reported_if_the_recorder_is_too_late(small: Logging, folder: Path) -> None:
     expect_recorder(folder)
-    log = logging(most_unrecorded_bytes=2000)
+    log = small(most_unrecorded_bytes=2000)
     kept = []
     for time_ns in range(1, 100):
         log.append(entry(time_ns, 40))
@@ -228,8 +226,8 @@ def test_oldest_segment_is_given_up_and_reported_if_the_recorder_is_too_late(
     assert times(folder)[-1] == 99
 
 
-def test_without_a_recorder_the_log_stays_small(logging: Logging, folder: Path, small: None) -> None:
-    log = logging()
+def test_without_a_recorder_the_log_stays_small(small: Logging, folder: Path) -> None:
+    log = small()
     for time_ns in range(1, 200):
         log.append(entry(time_ns, 40))
         assert log.clean([])
@@ -239,12 +237,12 @@ def test_without_a_recorder_the_log_stays_small(logging: Logging, folder: Path, 
 
 
 def test_a_segment_that_can_not_be_freed_yet_is_freed_later(
-    logging: Logging, folder: Path, small: None, monkeypatch: pytest.MonkeyPatch
+    small: Logging, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def held_open(path: Path, target: Path) -> Path:
         raise PermissionError(13, "another process is using this file", str(path))
 
-    log = logging()
+    log = small()
     with monkeypatch.context() as windows:
         windows.setattr(Path, "replace", held_open)
         for time_ns in range(1, 200):
@@ -285,12 +283,12 @@ def test_a_full_disk_is_not_filled_with_files_nor_with_halves(logging: Logging, 
 # --- following it ---
 
 
-def test_a_reader_follows_the_log_over_segments_and_lives(logging: Logging, folder: Path, small: None) -> None:
+def test_a_reader_follows_the_log_over_segments_and_lives(small: Logging, folder: Path) -> None:
     reader = LogReader(folder)
     assert reader.read(1000) == []
     found = []
     for life in range(3):
-        log = logging()
+        log = small()
         for time_ns in range(life * 20 + 1, life * 20 + 21):
             log.append(entry(time_ns, 40))
             if time_ns % 3 == 0:
@@ -299,8 +297,8 @@ def test_a_reader_follows_the_log_over_segments_and_lives(logging: Logging, fold
     assert found == list(range(1, 61))
 
 
-def test_reader_continues_at_the_position_of_another(logging: Logging, folder: Path, small: None) -> None:
-    log = logging()
+def test_reader_continues_at_the_position_of_another(small: Logging, folder: Path) -> None:
+    log = small()
     for time_ns in range(1, 30):
         log.append(entry(time_ns, 40))
     for one, position in LogReader(folder).read(1 << 20):
@@ -320,10 +318,8 @@ def test_a_reader_waits_for_the_rest_of_a_packet(logging: Logging, folder: Path)
     assert [one.packet.time_ns for one, _ in reader.read(1000)] == [1]
 
 
-def test_a_reader_of_segments_that_are_gone_goes_on_with_the_oldest_there_is(
-    logging: Logging, folder: Path, small: None
-) -> None:
-    log = logging()
+def test_a_reader_of_segments_that_are_gone_goes_on_with_the_oldest_there_is(small: Logging, folder: Path) -> None:
+    log = small()
     for time_ns in range(1, 60):
         log.append(entry(time_ns, 40))
     reader = LogReader(folder)

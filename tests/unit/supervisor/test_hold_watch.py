@@ -6,14 +6,14 @@ import logging
 import os
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
 from afspm.basics import shared_time
 from afspm.basics.clock import NS_PER_S, ExperimentClock
-from afspm.basics.shared_time import LONGEST_HOLD_S, SharedTime, TimeHold
-from afspm.supervisor import hold_watch
+from afspm.basics.shared_time import LONGEST_HOLD_S, MOST_HOLDS, SharedTime, TimeHold
 from afspm.supervisor.hold_watch import Drop, HoldWatch, drops
 
 HANGS = TimeHold(1, 0, 5 * NS_PER_S, 11)
@@ -29,11 +29,15 @@ def test_hold_is_dropped_after_its_limit_or_with_its_process() -> None:
 
 
 class _Watched:
-    def __init__(self, tmp_path: Path) -> None:
+    def __init__(self, tmp_path: Path, long_s: float = 60.0) -> None:
         self.clock = ExperimentClock.starting_now(1_000_000.0, 480.0).waiting_in(tmp_path / "clock")
         self.lines: list[tuple[int, str]] = []
         self.watch = HoldWatch(
-            self.clock, lambda level, text: self.lines.append((level, text)), lambda: {os.getpid(): "scheduler"}
+            self.clock,
+            lambda level, text: self.lines.append((level, text)),
+            lambda: {os.getpid(): "scheduler"},
+            every_s=0.0,
+            long_s=long_s,
         )
 
     @property
@@ -55,10 +59,8 @@ def test_wait_for_a_living_process_is_given_up_with_a_warning_and_counted(
     assert "10 min for scheduler" in text
 
 
-def test_long_wait_is_logged_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hold_watch, "LONG_S", 0.0)
-    monkeypatch.setattr(hold_watch, "LOOK_EVERY_S", 0.0)
-    watched = _Watched(tmp_path)
+def test_long_wait_is_logged_once(tmp_path: Path) -> None:
+    watched = _Watched(tmp_path, long_s=0.0)
     with watched.clock.late():
         watched.watch.look()
         watched.watch.look()
@@ -67,8 +69,7 @@ def test_long_wait_is_logged_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert (level, text.split(" has waited ")[1].rpartition(" ")[2]) == (logging.INFO, "scheduler")
 
 
-def test_time_goes_on_when_its_holder_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hold_watch, "LOOK_EVERY_S", 0.0)
+def test_time_goes_on_when_its_holder_is_killed(tmp_path: Path) -> None:
     watched = _Watched(tmp_path)
     program = f"""
 from afspm.basics.clock import ExperimentClock
@@ -89,10 +90,11 @@ with ExperimentClock.from_dict({watched.clock.as_dict()!r}).late():
     assert (watched.held, watched.watch.given_up) == (0, 0)
 
 
-def test_refused_hold_is_logged_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared_time, "MOST_HOLDS", 1)
+def test_refused_hold_is_logged_and_counted(tmp_path: Path) -> None:
     watched = _Watched(tmp_path)
-    with watched.clock.late(), watched.clock.late():
+    with ExitStack() as holds:
+        for _ in range(MOST_HOLDS + 1):
+            holds.enter_context(watched.clock.late())
         watched.watch.look()
     assert watched.watch.given_up == 1
     assert [text for _, text in watched.lines] == [

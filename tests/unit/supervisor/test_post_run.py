@@ -104,9 +104,7 @@ def test_the_report_is_written_by_another_process(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no FIFOs")
 @pytest.mark.parametrize("works", [True, False])
-def test_report_is_given_up_only_if_its_process_does_not_work(
-    works: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_report_is_given_up_only_if_its_process_does_not_work(works: bool, tmp_path: Path) -> None:
     RecordStore(tmp_path).close()
     gate, used_s = tmp_path / "gate", [0.0]
     os.mkfifo(gate)
@@ -119,11 +117,8 @@ def test_report_is_given_up_only_if_its_process_does_not_work(
         return used_s[0]
 
     waiting = [sys.executable, "-c", f"open({str(gate)!r}).read()"]
-    monkeypatch.setattr(post_run, "REPORT_STALLED_S", 0.05)
-    monkeypatch.setattr(post_run, "_processor_s", processor_s)
-    monkeypatch.setattr(post_run, "python_command", lambda _: waiting)
     log = Log()
-    post_run.report(tmp_path, log)  # type: ignore[arg-type]
+    post_run.report(tmp_path, log, command=waiting, stalled_s=0.05, processor_s=processor_s)  # type: ignore[arg-type]
     level, text = log.lines[-1]
     assert (level == logging.INFO) is works
     assert ("has not worked for" in text) is not works
@@ -180,16 +175,17 @@ def test_a_report_that_fails_is_a_warning(tmp_path: Path) -> None:
     assert text.startswith("no report: ")
 
 
-def test_notification_precedes_the_report(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_notification_precedes_the_report(tmp_path: Path) -> None:
     """The report may take two minutes, and a person may press Ctrl-C before."""
-    done: list[str] = []
-    monkeypatch.setattr(post_run, "tell", lambda *_: done.append("told"))
-    monkeypatch.setattr(post_run, "report", lambda *_: done.append("reported"))
+    RecordStore(tmp_path).close()
+    code = "import os, sys; open(sys.argv[2], 'w').write(str(os.path.exists(sys.argv[1])))"
+    command = [sys.executable, "-c", code, str(tmp_path / REPORT_FILE), str(tmp_path / "told.txt")]
     file = tmp_path / "experiment.toml"
     parts = [f'[{name}]\ncomponent = true\nclass = "{name.capitalize()}"\n' for name in ("simulator", "scheduler")]
-    file.write_text("\n".join(parts))
+    file.write_text("\n".join([*parts, f"[notify]\ncommand = {json.dumps(command)}\n"]))
     experiment = load(file)
     starts = experiment.launches(take_address=FreePorts().address)
     ended = EndedRun("night", tmp_path, RunOutcome(EndReason.ALL_DONE, "all components are done", (), 1.0), True)
     post_run.follow(experiment, ended, starts, ExperimentClock.real(), Log(), with_report=True)  # type: ignore[arg-type]
-    assert done == ["told", "reported"]
+    assert (tmp_path / "told.txt").read_text() == "False"
+    assert (tmp_path / REPORT_FILE).exists()

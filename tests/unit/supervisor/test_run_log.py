@@ -92,11 +92,10 @@ def test_closed_terminal_does_not_end_the_run(tmp_path: Path) -> None:
     assert "still here" in (tmp_path / "log.txt").read_text(encoding="utf-8")
 
 
-def test_blocked_terminal_delays_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocked_terminal_delays_nothing(tmp_path: Path) -> None:
     """Text is marked in the terminal, or Ctrl-S was pressed."""
-    monkeypatch.setattr("afspm.supervisor.log.SHOWN_WITHIN_S", 0.01)
     terminal = _Stopped()
-    log = RunLog(tmp_path / "log.txt", ExperimentClock.real(), terminal=terminal)
+    log = RunLog(tmp_path / "log.txt", ExperimentClock.real(), terminal=terminal, shown_within_s=0.01)
     for number in range(3):
         log.write("scheduler", logging.INFO, f"line {number}")
     log.close()
@@ -105,13 +104,11 @@ def test_blocked_terminal_delays_nothing(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a pipe that nobody reads stands in for a disk that hangs")
-def test_hanging_disk_delays_nothing_and_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("afspm.supervisor.log.SHOWN_WITHIN_S", 0.01)
-    monkeypatch.setattr("afspm.supervisor.log.SLOW_S", 0.05)
+def test_hanging_disk_delays_nothing_and_is_shown(tmp_path: Path) -> None:
     file, told = tmp_path / "log.txt", threading.Event()
     os.mkfifo(file)
     reader = os.open(file, os.O_RDONLY | os.O_NONBLOCK)
-    log = RunLog(file, ExperimentClock.real(), terminal=io.StringIO())
+    log = RunLog(file, ExperimentClock.real(), terminal=io.StringIO(), shown_within_s=0.01, slow_s=0.05)
     log.listener = lambda name, level, text: told.set() if level == logging.WARNING else None
 
     def write() -> None:

@@ -26,6 +26,7 @@ from afspm.model import (
     Request,
     Response,
     Scan,
+    ScanLines,
     ScopeState,
     ScopeStatus,
     Spectrum,
@@ -99,20 +100,28 @@ class FakeMicroscope(Driver):
             "P": 1.0, "Setpoint": 1.0, "Loop": True, "Speed": 1.0, "Mode": "IV", "Serial": "007",
             "Bias": 100.0, "Engaged": True,
         }  # fmt: skip
-        self.files: dict[str, list[Scan | Spectrum] | None] = {}
+        self.files: dict[str, list[Scan | Spectrum] | Exception | None] = {}
         self.done: list[str] = []
         self.set_calls = 0
         self.lost = False
         self.retracts_slowly = False
         self.stuck: dict[str, Value] = {}
-        self.fails: Exception | None = None
+        self.fails: BaseException | None = None
         self.confused: Exception | None = None
+        self.fails_to_connect: Exception | None = None
+        self.paused: bool | None = None
+        self.evidence = ""
+        self.withdrawal = ""
+        self.at_status: Callable[[], object] = list
+        self.after_set: Callable[[Mapping[str, Value]], object] = dict
         self.got = 0
         self.connected = 0
 
     def connect(self) -> None:
         if self.lost:
             raise ConnectionError("unplugged")
+        if self.fails_to_connect is not None:
+            raise self.fails_to_connect
         self.connected += 1
 
     def status(self) -> ScopeStatus:
@@ -120,7 +129,14 @@ class FakeMicroscope(Driver):
             raise ConnectionError("unplugged")
         if self.confused is not None:
             raise self.confused
-        return ScopeStatus(self.state)
+        self.at_status()
+        return ScopeStatus(self.state, paused=self.paused)
+
+    def stopped_by_hand(self) -> str:
+        return self.evidence
+
+    def withdrew_tip(self) -> str:
+        return self.withdrawal
 
     def get(self, vendor: str) -> Value:
         self.got += 1
@@ -134,6 +150,7 @@ class FakeMicroscope(Driver):
         self.set_calls += 1
         self.values.update(values)
         self.values.update({name: stuck for name, stuck in self.stuck.items() if name in values})
+        self.after_set(values)
 
     def results(self) -> Sequence[str]:
         return list(self.files)
@@ -142,6 +159,8 @@ class FakeMicroscope(Driver):
         found = self.files[result]
         if found is None:
             raise FileError("is not whole", where=result)
+        if isinstance(found, Exception):
+            raise found
         return found
 
     @action(names.START_SCAN)
@@ -181,6 +200,17 @@ class FakeMicroscope(Driver):
         self.done.append(text)
 
 
+class LiveMicroscope(FakeMicroscope):
+    """A controller with `there` lines of two channels."""
+
+    there = 0
+
+    def lines(self, start: int) -> list[ScanLines]:
+        region = Region((0.0, 0.0), (1e-6, 1e-6))
+        values = np.arange(start, self.there)[:, None] * np.ones((1, 3))
+        return [ScanLines(region, (8, 3), name, "m", start, values) for name in ("Height", "Phase")]
+
+
 def a_scan(channel: str = "Height") -> Scan:
     return Scan(Region((0.0, 0.0), (1e-6, 1e-6)), channel, "m", np.zeros((2, 3)), 5, "one.dat")
 
@@ -191,11 +221,13 @@ _BESIDE = (TipStatus, ActByHand, MeasurementConditions, ChannelRoles, FeedbackUn
 class Bench:
     """A translator on a fake network, with short calls for requests."""
 
-    def __init__(self, folder: Path, settings: dict[str, Any] | None = None) -> None:
+    def __init__(
+        self, folder: Path, settings: dict[str, Any] | None = None, kind: type[FakeMicroscope] = FakeMicroscope
+    ) -> None:
         self.clock = FakeClock()
         self.folder = folder
         self.beside: list[TipStatus | ActByHand | MeasurementConditions | ChannelRoles | FeedbackUnits] = []
-        self.microscope = FakeMicroscope(**(settings or {}))
+        self.microscope = kind(**(settings or {}))
         self.start()
 
     def start(self, *, retracts: bool = True, feedback_off: str = "") -> None:
@@ -261,6 +293,12 @@ def make_bench(tmp_path: Path) -> Any:
         return Bench(tmp_path, settings)
 
     return make
+
+
+@pytest.fixture
+def make_live_bench(make_bench: Any, tmp_path: Path) -> Any:
+    """Make benches whose controller shows its lines."""
+    return lambda settings: Bench(tmp_path, settings, LiveMicroscope)
 
 
 @pytest.fixture

@@ -7,12 +7,12 @@ import logging
 import os
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 from typing import BinaryIO
 
 import pytest
 from deadlines import DEADLINE_S
+from temporary_folder import use_temporary_folder
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.exit_codes import ExitCode
@@ -40,7 +40,7 @@ with commanding(sys.argv[1], "runs/the-dead"):
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of the locks."""
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    use_temporary_folder(tmp_path, monkeypatch)
     monkeypatch.setenv("PROGRAMDATA", str(tmp_path))
     return tmp_path / "afspm-controllers"
 

@@ -21,18 +21,8 @@ REGION = Region((0.0, 0.0), (1e-6, 1e-6))
 
 
 @pytest.fixture
-def live(make_bench: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """A translator whose controller has `bench.there` lines of two channels."""
-
-    def lines(self: Any, start: int) -> list[ScanLines]:
-        values = np.arange(start, bench.there)[:, None] * np.ones((1, 3))
-        return [ScanLines(REGION, (8, 3), name, "m", start, values) for name in ("Height", "Phase")]
-
-    bench: Any = None
-    bench = make_bench()
-    monkeypatch.setattr(type(bench.microscope), "lines", lines, raising=False)
-    bench = make_bench({"live_lines_s": 1.0})
-    bench.there = 0
+def live(make_live_bench: Any) -> Any:
+    bench = make_live_bench({"live_lines_s": 1.0})
     bench.heard()
     return bench
 
@@ -44,7 +34,7 @@ def published(bench: Any) -> list[ScanLines]:
 
 def test_new_lines_are_published_at_the_set_period(live: Any) -> None:
     live.ask(ControlRequest.ACTION, names.START_SCAN)
-    live.there = 3
+    live.microscope.there = 3
     live.look(0.5)
     assert published(live) == []
     live.look(0.5)
@@ -53,7 +43,7 @@ def test_new_lines_are_published_at_the_set_period(live: Any) -> None:
         ("Height", 0, [0, 1, 2]),
         ("Phase", 0, [0, 1, 2]),
     ]
-    live.there = 5
+    live.microscope.there = 5
     live.look(1.0)
     second = published(live)
     assert [(lines.first_row, len(lines.values)) for lines in second] == [(3, 2), (3, 2)]
@@ -64,7 +54,7 @@ def test_new_lines_are_published_at_the_set_period(live: Any) -> None:
 
 def test_the_next_scan_begins_with_its_first_line(live: Any, scan: Any) -> None:
     live.ask(ControlRequest.ACTION, names.START_SCAN)
-    live.there = 8
+    live.microscope.there = 8
     live.look(1.0)
     began_ns = published(live)[0].began_ns
     assert began_ns is not None
@@ -73,7 +63,7 @@ def test_the_next_scan_begins_with_its_first_line(live: Any, scan: Any) -> None:
     live.look(1.0)
     assert published(live) == []
     live.ask(ControlRequest.ACTION, names.START_SCAN)
-    live.there = 1
+    live.microscope.there = 1
     live.look(1.0)
     again = published(live)[0]
     assert (again.first_row, len(again.values)) == (0, 1)
@@ -82,23 +72,23 @@ def test_the_next_scan_begins_with_its_first_line(live: Any, scan: Any) -> None:
 
 def test_lines_go_on_after_a_pause(live: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     live.ask(ControlRequest.ACTION, names.START_SCAN)
-    live.there = 3
+    live.microscope.there = 3
     live.look(1.0)
     [began_ns] = {lines.began_ns for lines in published(live)}
     with monkeypatch.context() as patch:
         patch.setattr(live.microscope, "status", lambda: ScopeStatus(ScopeState.SCANNING, paused=True))
         live.look(5.0)
-    live.there = 5
+    live.microscope.there = 5
     live.look(1.0)
     assert {(lines.began_ns, lines.first_row, len(lines.values)) for lines in published(live)} == {(began_ns, 3, 2)}
 
 
 def test_restarted_translator_publishes_the_lines_of_a_running_scan_from_its_first(live: Any) -> None:
     live.ask(ControlRequest.ACTION, names.START_SCAN)
-    live.there = 3
+    live.microscope.there = 3
     live.look(1.0)
     live.start()
-    live.there = 5
+    live.microscope.there = 5
     live.look(1.0)
     assert [(lines.first_row, len(lines.values)) for lines in published(live)] == [(0, 5), (0, 5)]
     live.microscope.state = ScopeState.FREE
@@ -132,7 +122,7 @@ def test_lines_that_cannot_be_read_do_not_lose_the_controller(
 def test_lines_are_not_cached_for_late_joiners(live: Any) -> None:
     live.ask(ControlRequest.ACTION, names.START_SCAN)
     live.heard()
-    live.there = 8
+    live.microscope.there = 8
     live.look(1.0)
     assert live.port.kept == []
     assert published(live)
@@ -144,12 +134,13 @@ def test_lines_are_read_when_due(live: Any) -> None:
     assert live.translator.wait_s() <= 0.0101
 
 
-def test_lines_are_not_read_without_the_setting(make_bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench = make_bench()
-    monkeypatch.setattr(type(bench.microscope), "lines", lambda self, start: pytest.fail("it is asked"), raising=False)
+def test_lines_are_not_read_without_the_setting(make_live_bench: Any) -> None:
+    bench = make_live_bench(None)
+    bench.microscope.there = 3
     bench.ask(ControlRequest.ACTION, names.START_SCAN)
     for _ in range(50):
         bench.look(1.0)
+    assert published(bench) == []
 
 
 def test_driver_without_lines_refuses_the_setting(make_bench: Any) -> None:

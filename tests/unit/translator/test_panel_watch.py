@@ -18,7 +18,6 @@ from afspm.model import (
     Region,
     ScanParameters,
     ScopeState,
-    ScopeStatus,
     Spectrum,
     TipStatus,
     names,
@@ -196,20 +195,15 @@ def test_withdrawn_tip_spoils_the_running_scan_and_not_the_one_before_it(bench: 
     assert bench.heard() == ["INTERRUPTED", "FREE"]
 
 
-def test_a_tip_withdrawn_within_the_look_that_shows_the_end_spoils_the_scan(
-    bench: Any, scan: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_tip_withdrawn_within_the_look_that_shows_the_end_spoils_the_scan(bench: Any, scan: Any) -> None:
     begin_scan(bench)
     bench.heard()
     bench.microscope.files["a"] = [scan()]
-    real = bench.microscope.status
 
-    def withdrawn_meanwhile() -> ScopeStatus:  # the values are read before the state
+    def withdraw() -> None:  # the values are read before the state
         bench.microscope.values["Engaged"], bench.microscope.state = False, ScopeState.FREE
-        status: ScopeStatus = real()
-        return status
 
-    monkeypatch.setattr(bench.microscope, "status", withdrawn_meanwhile)
+    bench.microscope.at_status = withdraw
     bench.look()
     assert bench.heard() == ["INTERRUPTED", "FREE"]
     assert acts(bench) == [PanelAct.WITHDRAW]
@@ -230,23 +224,15 @@ def test_a_tip_withdrawn_just_after_a_request_is_by_hand(bench: Any) -> None:
     assert acts(bench) == [PanelAct.WITHDRAW]
 
 
-def person_after_each_set(bench: Any, monkeypatch: pytest.MonkeyPatch, *acts_of_person: dict[str, float]) -> None:
+def person_after_each_set(bench: Any, *acts_of_person: dict[str, float]) -> None:
     """Let a person set values right after each setting by a request, in turn."""
-    plain, left = bench.microscope.set, list(acts_of_person)
-
-    def both(values: Any) -> None:
-        plain(values)
-        if left:
-            bench.microscope.values.update(left.pop(0))
-
-    monkeypatch.setattr(bench.microscope, "set", both)
+    left = list(acts_of_person)
+    bench.microscope.after_set = lambda _: bench.microscope.values.update(left.pop(0) if left else {})
 
 
 # results M5
-def test_value_set_by_a_person_in_the_middle_of_a_request_is_an_act_and_the_request_succeeds(
-    bench: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    person_after_each_set(bench, monkeypatch, {"Bias": 1000.0})
+def test_value_set_by_a_person_in_the_middle_of_a_request_is_an_act_and_the_request_succeeds(bench: Any) -> None:
+    person_after_each_set(bench, {"Bias": 1000.0})
     assert bench.ask(PARAM, Parameter("tip-bias-voltage", "0.3", "V")).code == OK
     assert bench.microscope.values["Bias"] == 300.0
     bench.look()
@@ -258,10 +244,8 @@ def test_value_set_by_a_person_in_the_middle_of_a_request_is_an_act_and_the_requ
 
 
 # results M5
-def test_frame_moved_by_a_person_in_the_middle_of_a_request_is_an_act_and_the_request_succeeds(
-    bench: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    person_after_each_set(bench, monkeypatch, {"X": 300.0})
+def test_frame_moved_by_a_person_in_the_middle_of_a_request_is_an_act_and_the_request_succeeds(bench: Any) -> None:
+    person_after_each_set(bench, {"X": 300.0})
     wanted = ScanParameters(Region((0.0, 0.0), (1e-6, 0.5e-6)), (4, 8))
     assert bench.ask(ControlRequest.SET_SCAN_PARAMS, wanted).code == OK
     assert bench.microscope.values["X"] == -500.0
@@ -269,10 +253,8 @@ def test_frame_moved_by_a_person_in_the_middle_of_a_request_is_an_act_and_the_re
 
 
 # results M5
-def test_person_who_keeps_changing_a_value_is_waited_for_twice_and_never_set_back(
-    bench: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    person_after_each_set(bench, monkeypatch, *({"Bias": 500.0 + number} for number in range(6)))
+def test_person_who_keeps_changing_a_value_is_waited_for_twice_and_never_set_back(bench: Any) -> None:
+    person_after_each_set(bench, *({"Bias": 500.0 + number} for number in range(6)))
     wanted = Parameter("tip-bias-voltage", "0.3", "V")
     answers = [bench.ask(PARAM, wanted) for _ in range(4)]
     assert [one.code for one in answers] == [
@@ -285,9 +267,9 @@ def test_person_who_keeps_changing_a_value_is_waited_for_twice_and_never_set_bac
     assert acts(bench) == [PanelAct.VALUES] * 3
 
 
-def test_value_that_the_controller_rounds_is_set_twice_and_no_act(bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_value_that_the_controller_rounds_is_set_twice_and_no_act(bench: Any) -> None:
     rounded = {"Bias": 250.0}
-    person_after_each_set(bench, monkeypatch, rounded, rounded)
+    person_after_each_set(bench, rounded, rounded)
     refused = bench.ask(PARAM, Parameter("tip-bias-voltage", "0.3", "V"))
     assert refused.code == ControlResponse.PARAM_ERROR
     assert "set 250 mV instead of 300 mV; the former values were restored" in refused.reason
@@ -324,8 +306,8 @@ def test_a_withdrawal_that_takes_time_gives_one_act(bench: Any) -> None:
     assert acts(bench) == [PanelAct.WITHDRAW], "the feedback of a withdrawn tip is no act of its own"
 
 
-def test_a_scan_that_a_withdrawal_ends_gives_no_stop_as_well(bench: Any, monkeypatch: Any) -> None:
-    monkeypatch.setattr(bench.microscope, "stopped_by_hand", lambda: EVIDENCE, raising=False)
+def test_a_scan_that_a_withdrawal_ends_gives_no_stop_as_well(bench: Any) -> None:
+    bench.microscope.evidence = EVIDENCE
     begin_scan(bench)
     bench.heard()
     bench.microscope.values["Engaged"] = False
@@ -334,8 +316,8 @@ def test_a_scan_that_a_withdrawal_ends_gives_no_stop_as_well(bench: Any, monkeyp
     assert acts(bench) == [PanelAct.WITHDRAW]
 
 
-def test_a_tip_that_the_controller_itself_withdrew_is_no_act_by_hand(bench: Any, monkeypatch: Any) -> None:
-    monkeypatch.setattr(bench.microscope, "withdrew_tip", lambda: "the safe tip withdrew it", raising=False)
+def test_a_tip_that_the_controller_itself_withdrew_is_no_act_by_hand(bench: Any) -> None:
+    bench.microscope.withdrawal = "the safe tip withdrew it"
     bench.microscope.values["Engaged"] = False
     bench.look()
     assert acts(bench) == []
@@ -430,8 +412,8 @@ def test_a_run_begun_with_a_withdrawn_tip_measures_in_the_air_until_the_tip_was_
 
 
 @pytest.mark.parametrize("evidence", [EVIDENCE, ""])
-def test_a_stop_is_by_hand_only_with_evidence(bench: Any, monkeypatch: Any, evidence: str) -> None:
-    monkeypatch.setattr(bench.microscope, "stopped_by_hand", lambda: evidence, raising=False)
+def test_a_stop_is_by_hand_only_with_evidence(bench: Any, evidence: str) -> None:
+    bench.microscope.evidence = evidence
     begin_scan(bench)
     bench.heard()
     bench.microscope.state = ScopeState.INTERRUPTED
@@ -439,29 +421,29 @@ def test_a_stop_is_by_hand_only_with_evidence(bench: Any, monkeypatch: Any, evid
     assert acts(bench) == ([PanelAct.STOP] if evidence else [])
 
 
-def test_a_stop_after_a_pause_is_by_hand(bench: Any, monkeypatch: Any) -> None:
-    monkeypatch.setattr(bench.microscope, "stopped_by_hand", lambda: EVIDENCE, raising=False)
+def test_a_stop_after_a_pause_is_by_hand(bench: Any) -> None:
+    bench.microscope.evidence = EVIDENCE
     begin_scan(bench)
-    with monkeypatch.context() as paused:
-        paused.setattr(bench.microscope, "status", lambda: ScopeStatus(ScopeState.SCANNING, paused=True))
-        bench.look()
+    bench.microscope.paused = True
+    bench.look()
+    bench.microscope.paused = False
     bench.microscope.state = ScopeState.INTERRUPTED
     bench.look()
     assert acts(bench) == [PanelAct.PAUSE, PanelAct.STOP]
 
 
-def test_a_stop_asked_for_is_not_by_hand(bench: Any, monkeypatch: Any) -> None:
-    monkeypatch.setattr(bench.microscope, "stopped_by_hand", lambda: EVIDENCE, raising=False)
+def test_a_stop_asked_for_is_not_by_hand(bench: Any) -> None:
+    bench.microscope.evidence = EVIDENCE
     begin_scan(bench)
     assert bench.ask(ACTION, names.STOP_SCAN).code == OK
     bench.look()
     assert acts(bench) == []
 
 
-def test_a_stop_of_a_scan_of_before_a_restart_is_unknown(bench: Any, monkeypatch: Any) -> None:
+def test_a_stop_of_a_scan_of_before_a_restart_is_unknown(bench: Any) -> None:
     begin_scan(bench)
     bench.start()
-    monkeypatch.setattr(bench.microscope, "stopped_by_hand", lambda: EVIDENCE, raising=False)
+    bench.microscope.evidence = EVIDENCE
     bench.heard()
     bench.microscope.state = ScopeState.INTERRUPTED
     bench.look()
@@ -491,10 +473,8 @@ def test_each_scan_has_the_tip_at_its_begin_and_end(bench: Any, scan: Any) -> No
 
 
 @pytest.mark.parametrize("shown", [ScopeState.INTERRUPTED, ScopeState.FREE])
-def test_a_scan_that_a_restarted_controller_lost_is_no_act_by_hand(
-    bench: Any, monkeypatch: Any, shown: ScopeState
-) -> None:
-    monkeypatch.setattr(bench.microscope, "stopped_by_hand", lambda: EVIDENCE, raising=False)
+def test_a_scan_that_a_restarted_controller_lost_is_no_act_by_hand(bench: Any, shown: ScopeState) -> None:
+    bench.microscope.evidence = EVIDENCE
     begin_scan(bench)
     bench.microscope.lost = True
     bench.look()

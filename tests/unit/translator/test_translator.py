@@ -176,17 +176,11 @@ def test_translator_killed_while_switching_the_feedback_off_retracts_after_its_r
     assert bench.microscope.done == ["retract"]
 
 
-def broken(*_: Any) -> Any:
-    raise ValueError("a bug of the implementer, or a controller that makes no sense")
-
-
 @pytest.mark.parametrize("what", ["status", "load"])
-def test_retract_works_although_the_state_can_not_be_read(
-    bench: Any, monkeypatch: pytest.MonkeyPatch, what: str
-) -> None:
+def test_retract_works_although_the_state_can_not_be_read(bench: Any, what: str) -> None:
     switched(bench, "false")
-    bench.microscope.files["one.dat"] = []
-    monkeypatch.setattr(bench.microscope, what, broken)
+    bug = ValueError("a bug of the implementer, or a controller that makes no sense")
+    bench.microscope.confused, bench.microscope.files["one.dat"] = (bug, []) if what == "status" else (None, bug)
     for _ in range(3):
         bench.look(after_s=1.0)
     assert bench.ask(ACTION, names.RETRACT).code == OK
@@ -217,14 +211,9 @@ def test_retract_is_retried_on_a_new_connection(bench: Any, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("at_stop", [False, True])
-def test_tip_is_retracted_although_connecting_fails_halfway(
-    bench: Any, monkeypatch: pytest.MonkeyPatch, at_stop: bool
-) -> None:
-    def without_folder() -> None:
-        raise ConfigError("the folder of data does not exist")
-
+def test_tip_is_retracted_although_connecting_fails_halfway(bench: Any, at_stop: bool) -> None:
     switched(bench, "false")
-    monkeypatch.setattr(bench.microscope, "connect", without_folder)
+    bench.microscope.fails_to_connect = ConfigError("the folder of data does not exist")
     bench.microscope.confused = ConnectionError("unplugged")
     bench.look()
     if at_stop:
@@ -234,20 +223,14 @@ def test_tip_is_retracted_although_connecting_fails_halfway(
     assert bench.microscope.done[0] == "retract"
 
 
-def test_question_for_the_retract_logs_no_retraction(
-    bench: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(bench.microscope, "connect", unplugged)
+def test_question_for_the_retract_logs_no_retraction(bench: Any, caplog: pytest.LogCaptureFixture) -> None:
+    bench.microscope.fails_to_connect = ConnectionError("unplugged")
     bench.microscope.confused = OSError("no space left")
     bench.look()
-    monkeypatch.setattr(bench.microscope, "connect", full_disk)
+    bench.microscope.fails_to_connect = RuntimeError("no space left")
     assert bench.ask(ControlRequest.ACTION_SUPPORT, names.RETRACT).code == OK
     assert "retracted" not in caplog.text
     assert bench.microscope.done == []
-
-
-def full_disk(*_: Any) -> Any:
-    raise RuntimeError("no space left")
 
 
 def unplugged(*_: Any) -> Any:
@@ -450,14 +433,9 @@ def test_feedback_is_switched_off_and_published(bench: Any) -> None:
     assert bench.microscope.values["Loop"] is True
 
 
-def test_feedback_is_switched_on_last_and_off_first(bench: Any, monkeypatch: Any) -> None:
-    plain, order = bench.microscope.set, []
-
-    def noted(given: Any) -> None:
-        order.append(set(given))
-        plain(given)
-
-    monkeypatch.setattr(bench.microscope, "set", noted)
+def test_feedback_is_switched_on_last_and_off_first(bench: Any) -> None:
+    order: list[set[str]] = []
+    bench.microscope.after_set = lambda given: order.append(set(given))
     assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False, setpoint=0.5e-9)).code == OK
     assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True, setpoint=0.75e-9)).code == OK
     assert order == [{"Loop"}, {"Setpoint"}, {"Setpoint"}, {"Loop"}]
@@ -560,15 +538,14 @@ def test_difference_below_the_digits_shown_is_in_the_reason(bench: Any) -> None:
     assert "set 100 mV instead of 100 mV, 1e-05 mV off: if that is its precision" in reason
 
 
-def test_change_in_the_rest_of_the_frame_is_refused_and_restored(bench: Any, monkeypatch: Any) -> None:
-    plain, values = bench.microscope.set, bench.microscope.values
+def test_change_in_the_rest_of_the_frame_is_refused_and_restored(bench: Any) -> None:
+    values = bench.microscope.values
 
     def square(given: Any) -> None:
-        plain(given)
         if "H" not in given and "W" in given:
             values["H"] = given["W"]
 
-    monkeypatch.setattr(bench.microscope, "set", square)
+    bench.microscope.after_set = square
     response = bench.ask(PARAM, Parameter("scan-size-x", "2", "um"))
     assert response.code == PARAM_ERROR
     assert (
@@ -577,17 +554,16 @@ def test_change_in_the_rest_of_the_frame_is_refused_and_restored(bench: Any, mon
     assert (values["W"], values["H"]) == (1000.0, 500.0)
 
 
-def test_refused_frame_restores_the_speed_of_a_controller_with_lines_per_second(bench: Any, monkeypatch: Any) -> None:
-    plain, values = bench.microscope.set, bench.microscope.values
+def test_refused_frame_restores_the_speed_of_a_controller_with_lines_per_second(bench: Any) -> None:
+    values = bench.microscope.values
     speed_before = values["Speed"]
 
     def half_set(given: Any) -> None:
-        plain(given)
         if given.get("W") == 2000.0:  # the width is set, its line rate is refused
             values["Speed"] *= 2.0
             raise Refused(PARAM_ERROR, "the line rate is too low")
 
-    monkeypatch.setattr(bench.microscope, "set", half_set)
+    bench.microscope.after_set = half_set
     assert bench.ask(PARAM, Parameter("scan-size-x", "2", "um")).code == PARAM_ERROR
     assert (values["W"], values["Speed"]) == (1000.0, speed_before)
 
@@ -991,8 +967,7 @@ def test_scan_that_does_not_end_is_logged_once(bench: Any, scan: Any, caplog: py
     bench.microscope.values["Speed"] = 0.01
     bench.look(after_s=1.0)
     assert bench.ask(ACTION, names.START_SCAN).code == OK
-    lasts_s, _ = bench.translator.observer._expected_scan()
-    assert lasts_s is not None
+    lasts_s = 2.0 * 1e-6 * 4 / 0.01e-6  # trace and retrace of four lines, 1 µm wide, at 0.01 µm/s
     bench.look(after_s=OVERDUE_RATIO * lasts_s + OVERDUE_S - 1.0)
     bench.microscope.state = ScopeState.FREE
     bench.microscope.files["a"] = [scan()]
@@ -1019,19 +994,15 @@ def test_restarted_translator_does_not_repeat_requests(bench: Any) -> None:
 
 
 def test_request_interrupted_by_a_kill_is_not_repeated(bench: Any) -> None:
-    request = wire.decode_request(wire.encode_request(_request("me/1/1")))
-    bench.translator.requests._record_begin(request)  # killed right here
+    bench.microscope.fails = KeyboardInterrupt()  # killed right within the action
+    with pytest.raises(KeyboardInterrupt):
+        bench.ask(ACTION, names.START_SCAN, "me/1/1")
+    bench.microscope.fails = None
     bench.start()
     response = bench.ask(ACTION, names.START_SCAN, "me/1/1")
     assert response.code == ControlResponse.NO_RESPONSE
     assert "restarted" in response.reason
     assert bench.microscope.done == []
-
-
-def _request(request_id: str) -> Any:
-    from afspm.model import Request
-
-    return Request(ACTION, names.START_SCAN, b"", request_id)
 
 
 def test_a_scan_that_ended_while_the_translator_was_down_is_delivered_once(bench: Any, scan: Any) -> None:

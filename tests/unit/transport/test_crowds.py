@@ -12,9 +12,9 @@ import zmq
 
 from afspm.basics.clock import ExperimentClock
 from afspm.model import Packet
-from afspm.transport import late_joiners, network, publisher, subscriber
+from afspm.transport import late_joiners, publisher, subscriber
 from afspm.transport.late_joiners import BEACON, Marker, PublishedHistory, decode_newest
-from afspm.transport.network import QUEUE_LENGTH, Network
+from afspm.transport.network import QUEUE_LENGTH, LinkTimes, Network
 from afspm.transport.port import CaughtUp, Killed, PacketReceived
 from afspm.transport.publisher import Publisher
 from afspm.transport.rate_limited_log import RateLimitedLog
@@ -28,10 +28,10 @@ LOG = RateLimitedLog(logging.getLogger("test"), CLOCK)
 class PublisherLab:
     """A publisher that counts its replays, and can lose a packet as a full queue does."""
 
-    def __init__(self) -> None:
+    def __init__(self, times: LinkTimes | None = None) -> None:
         self.published = PublishedHistory(CLOCK, most_packets=2 * QUEUE_LENGTH)
         self.replays: list[tuple[str, ...]] = []
-        self.network = Network()
+        self.network = Network(times=times)
         self.publisher = Publisher(self.network, ANY, self._history, self.published.newest, LOG)
         self.address = self.publisher.address
 
@@ -95,12 +95,9 @@ def test_plain_subscribers_that_join_together_share_one_replay(lab: PublisherLab
     assert max(map(len, got)) <= most * 50
 
 
-def test_replay_to_plain_subscribers_leaves_room_for_newer_packets(
-    open_: Any, plain: Any, until: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_replay_to_plain_subscribers_leaves_room_for_newer_packets(open_: Any, plain: Any, until: Any) -> None:
     # faults 3
-    monkeypatch.setattr(network, "_STALLED_MS", 60_000)
-    lab = open_(PublisherLab())
+    lab = open_(PublisherLab(times=LinkTimes(stalled=60_000)))
     slow, late = plain(zmq.SUB), plain(zmq.SUB)
     slow.setsockopt(zmq.RCVHWM, 1)
     slow.setsockopt(zmq.RCVBUF, 1 << 16)
@@ -211,7 +208,7 @@ def test_beacon_reaches_only_subscribers_with_a_marker(lab: PublisherLab, plain:
 
 @pytest.mark.usefixtures("quick")
 def test_signal_of_the_end_is_repeated_for_a_subscriber_that_has_lost_it(
-    lab: PublisherLab, open_: Any, until: Any, monkeypatch: pytest.MonkeyPatch
+    lab: PublisherLab, open_: Any, until: Any
 ) -> None:
     got: list[Any] = []
     port = open_(ZmqPort(Network(), "Series", CLOCK, subscribe=[lab.address]))

@@ -19,7 +19,7 @@ from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import TransportError
 from afspm.transport import network
 from afspm.transport.frames import receive_frames, send_frames
-from afspm.transport.network import CONNECTED, Monitor, Network
+from afspm.transport.network import CONNECTED, LinkTimes, Monitor, Network
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.scheduler_sockets import TranslatorLink
 
@@ -43,12 +43,9 @@ def unreachable() -> Iterator[int]:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse where what waits is full")
-def test_attempt_to_connect_is_ended_and_begun_again(
-    unreachable: int, open_: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert network._CONNECT_MS <= 3_000  # a partition is to heal within ten seconds
-    monkeypatch.setattr(network, "_OPTIONS", (*network._OPTIONS, (zmq.CONNECT_TIMEOUT, 300)))
-    ours = open_(Network())
+def test_attempt_to_connect_is_ended_and_begun_again(unreachable: int, open_: Any) -> None:
+    assert LinkTimes().connect <= 3_000  # a partition must heal within ten seconds
+    ours = open_(Network(times=LinkTimes(connect=300)))
     dealer = ours.socket(zmq.DEALER)
     monitor = Monitor(ours, dealer, zmq.EVENT_CONNECT_RETRIED)
     ours.connect(dealer, f"tcp://127.0.0.1:{unreachable}")

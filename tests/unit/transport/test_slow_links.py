@@ -19,7 +19,7 @@ from systems import not_on_wine
 from afspm.basics.clock import ExperimentClock
 from afspm.transport import network
 from afspm.transport.late_joiners import Marker, topic
-from afspm.transport.network import Network
+from afspm.transport.network import LinkTimes, Network
 from afspm.transport.port import PacketReceived
 from afspm.transport.zmq_port import ZmqPort
 from afspm.transport.zmq_server import ZmqServerPort
@@ -137,17 +137,16 @@ class Lab:
         stalled_ms: time after which the subscriber ends its connection if nothing that it sends is acknowledged.
     """
 
-    def __init__(self, open_: Any, until: Any, monkeypatch: pytest.MonkeyPatch, stalled_ms: int) -> None:
+    def __init__(self, open_: Any, until: Any, stalled_ms: int) -> None:
         self._until = until
-        monkeypatch.setattr(network, "_ALIVE_CHECK_MS", HEARTBEAT_MS)
-        monkeypatch.setattr(network, "_ANSWERED_WITHIN_MS", PATIENCE_MS)
-        # the patience of the publisher, which must not end while a busy computer runs nothing of the test
-        monkeypatch.setattr(network, "_ALIVE_TIMEOUT_MS", BUSY_MS)
-        monkeypatch.setattr(network, "_STALLED_MS", BUSY_MS)
-        self.publisher = open_(ZmqServerPort(Network(), CLOCK, serve=ANY, publish=ANY))
+        # the patience of the publisher must not end while a busy computer runs nothing of the test
+        ours, theirs = (
+            Network(times=LinkTimes(check=HEARTBEAT_MS, answered=PATIENCE_MS, alive=BUSY_MS, stalled=one))
+            for one in (BUSY_MS, stalled_ms)
+        )
+        self.publisher = open_(ZmqServerPort(ours, CLOCK, serve=ANY, publish=ANY))
         self.link = open_(SlowLink(self.publisher.publish_address))
-        monkeypatch.setattr(network, "_STALLED_MS", stalled_ms)
-        self._subscriber = open_(ZmqPort(Network(), "Left", CLOCK, subscribe=[self.link.address]))
+        self._subscriber = open_(ZmqPort(theirs, "Left", CLOCK, subscribe=[self.link.address]))
         self._found: list[Any] = []
         self.publisher.publish("Note", b"first")
         self.until(lambda: self.payloads == [b"first"])
@@ -161,8 +160,8 @@ class Lab:
 
 
 @pytest.fixture
-def make_lab(open_: Any, until: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], Lab]:
-    return lambda stalled_ms: Lab(open_, until, monkeypatch, stalled_ms)
+def make_lab(open_: Any, until: Any) -> Callable[[int], Lab]:
+    return lambda stalled_ms: Lab(open_, until, stalled_ms)
 
 
 @WITHOUT_MAXRT
@@ -210,9 +209,9 @@ def test_subscriber_awaits_answers_only_where_nothing_else_ends_its_connection(
     ours = open_(Network())
     monkeypatch.setattr(network, "_can_end_stalled", lambda: True)
     assert awaited_ms(zmq.XSUB) == 0
-    assert awaited_ms(zmq.DEALER) == awaited_ms(zmq.ROUTER) == network._ANSWERED_WITHIN_MS
+    assert awaited_ms(zmq.DEALER) == awaited_ms(zmq.ROUTER) == LinkTimes().answered
     monkeypatch.setattr(network, "_can_end_stalled", lambda: False)
-    assert awaited_ms(zmq.XSUB) == network._ANSWERED_WITHIN_MS
+    assert awaited_ms(zmq.XSUB) == LinkTimes().answered
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,8 @@ import zmq
 from systems import not_on_wine
 
 from afspm.basics.clock import ExperimentClock
-from afspm.transport import network
 from afspm.transport.late_joiners import PublishedHistory
-from afspm.transport.network import DISCONNECTED, Monitor, Network
+from afspm.transport.network import DISCONNECTED, LinkTimes, Monitor, Network
 from afspm.transport.port import PacketReceived
 from afspm.transport.publisher import Publisher
 from afspm.transport.rate_limited_log import RateLimitedLog
@@ -26,19 +25,18 @@ CLOCK = ExperimentClock.real()
 LOG = RateLimitedLog(logging.getLogger("test"), CLOCK)
 SCAN = bytes(4_000_000)
 SCANS = 40
+QUIET = LinkTimes(check=0, stalled=500)
 
 
 @pytest.fixture
-def publisher(monkeypatch: pytest.MonkeyPatch, open_: Any) -> Any:
+def publisher(open_: Any) -> Any:
     """Return a publisher that waits for a peer for half a second and keeps only its last packet."""
-    monkeypatch.setattr(network, "_STALLED_MS", 500)
-    # heartbeats would let a busy computer disconnect it for another reason
-    monkeypatch.setattr(network, "_heartbeats", lambda kind: ())
     published = PublishedHistory(CLOCK, most_packets=2 * SCANS, most_bytes=2 * SCANS * len(SCAN))
 
     class Lab:
         def __init__(self) -> None:
-            self.network = Network()
+            # heartbeats would let a busy computer disconnect it for another reason
+            self.network = Network(times=QUIET)
             self.publisher = Publisher(self.network, ANY, published, published.newest, LOG)
             self._monitor = Monitor(self.network, self.publisher.socket, DISCONNECTED)
             self.address = self.publisher.address
@@ -65,7 +63,7 @@ def test_packets_for_a_stalled_subscriber_are_dropped_and_others_miss_nothing(
     stalled.setsockopt(zmq.RCVHWM, 1)
     stalled.subscribe(b"")
     stalled.connect(publisher.address)
-    healthy = open_(ZmqPort(Network(), "Healthy", CLOCK, subscribe=[publisher.address]))
+    healthy = open_(ZmqPort(Network(times=QUIET), "Healthy", CLOCK, subscribe=[publisher.address]))
     got: list[Any] = []
     happened: list[Any] = []
 
@@ -104,7 +102,7 @@ def test_stalled_subscriber_that_continues_gets_everything_once(
 
     with monkeypatch.context() as patch:
         patch.setattr(Network, "socket", socket)
-        stalled = open_(ZmqPort(Network(), "Stalled", CLOCK, subscribe=[publisher.address]))
+        stalled = open_(ZmqPort(Network(times=QUIET), "Stalled", CLOCK, subscribe=[publisher.address]))
     got: list[Any] = []
     publisher.publish(b"first")
     until(lambda: any(isinstance(i, PacketReceived) for i in got), (publisher, []), (stalled, got))

@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 
 COLUMNS = ("datetime", "filename", "offset_x", "offset_y", "rate_x", "rate_y", "units", *RECORD, "lost", "correcting")
 _ALBUM = "afspm.plugins.drift.report.album"
-_COMPARED_WITHIN_S = (
-    15.0  # at the end: the supervisor waits for a minute, and drawing takes most of it on a busy computer
-)
 
 
 class DriftTable(Component):
@@ -147,6 +144,8 @@ class DriftPictures(DriftTable):
     """
 
     longest_step_s: ClassVar[float] = 60.0
+    # at the end: the supervisor waits for a minute, and drawing takes most of it on a busy computer
+    compared_within_s: ClassVar[float] = 15.0
     period_s = 2.0
     period_time: Literal["experiment", "real"] = "real"
 
@@ -232,7 +231,7 @@ class DriftPictures(DriftTable):
         from afspm.plugins.drift.report.album import RunPart
         from afspm.plugins.drift.track.offline import against_first
 
-        made, until_s = [], self.clock.monotonic_s() + _COMPARED_WITHIN_S
+        made, until_s = [], self.clock.monotonic_s() + self.compared_within_s
         for name, start, stop in parts(tabled):
             pairs = self._compared_until(until_s, tabled[start], tabled[start + 1 : stop])
             complete = len(pairs) == stop - start - 1

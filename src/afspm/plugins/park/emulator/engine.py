@@ -23,8 +23,6 @@ LONGEST_S: Final = 5.0
 """Limit of a script's computing between two requests to the instrument, in real seconds.
 
 The script's thread continues: the engine can't be interrupted."""
-_AT_ONCE_S: Final = 0.25
-"""Longest turn of a script before other clients are served, in real seconds; most scripts end earlier."""
 MOST_ALONE: Final = 20
 """Requests that a script may still send to the instrument once its client has gone: enough for a withdrawal."""
 _MEMORY: Final = 64 << 20
@@ -54,6 +52,8 @@ class Script:
         names: the "values" and "methods" of `spm`.
         wake: called from the script's thread when `step` has more to do.
         is_alone: returns whether the script's client has gone.
+        at_once_s: longest turn before other clients are served, in real seconds; most scripts end earlier.
+        longest_s: limit of computing between two requests to the instrument, in real seconds.
     """
 
     def __init__(
@@ -63,7 +63,11 @@ class Script:
         ask: Ask,
         wake: Callable[[], None] = lambda: None,
         is_alone: Callable[[], bool] = lambda: False,
+        *,
+        at_once_s: float = 0.25,
+        longest_s: float = LONGEST_S,
     ) -> None:
+        self._at_once_s, self._longest_s = at_once_s, longest_s
         self._ask, self._wake, self._is_alone = ask, wake, is_alone
         self._asked_alone = 0
         self._computes_since_s = time.monotonic()
@@ -77,9 +81,9 @@ class Script:
         """Continue the script; return its value and text, or None while the script waits or computes.
 
         Raises:
-            ScriptFailed: the script failed, computed longer than `LONGEST_S`, or goes on although its client has gone.
+            ScriptFailed: the script failed, computed longer than `longest_s`, or goes on although its client has gone.
         """
-        until_s = time.monotonic() + _AT_ONCE_S
+        until_s = time.monotonic() + self._at_once_s
         if self._wait is not None:
             if self._wait.waiting():
                 return None
@@ -114,7 +118,7 @@ class Script:
     @property
     def computes_for_s(self) -> float:
         """The real seconds of computing left to the script; infinity while the script waits for the instrument."""
-        return math.inf if self.waits else self._computes_since_s + LONGEST_S - time.monotonic()
+        return math.inf if self.waits else self._computes_since_s + self._longest_s - time.monotonic()
 
     def end(self) -> None:
         """End the script: all its further requests fail."""
