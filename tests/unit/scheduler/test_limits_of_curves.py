@@ -6,8 +6,9 @@ import pytest
 from tests.unit.scheduler.core_parts import Held
 
 from afspm.model import ControlRequest, Parameter, Request, names
+from afspm.scheduler.safety.forbidden_states import PresentState
 from afspm.scheduler.safety.limit_checker import LimitChecker
-from afspm.scheduler.safety.limits import ExperimentLimits, Limit
+from afspm.scheduler.safety.limits import ExperimentLimits, ForbiddenState, Limit
 
 BIAS = Limit(-3.0, 3.0, unit="V", source="e.toml:4")
 CURVE = Request(int(ControlRequest.ACTION), names.START_SPEC, id="curve")
@@ -80,3 +81,16 @@ def test_ends_of_a_vector_program_are_not_those_of_the_table() -> None:
 def test_nothing_is_read_without_a_range_that_a_curve_could_break(limits: dict[str, Limit]) -> None:
     assert not {names.SPEC_KIND, *names.SPEC_ENDS} & set(guard(**limits).depends_on(CURVE))
     assert refused(guard(**limits), "IV") == ""
+
+
+@pytest.mark.parametrize(("last", "kind", "may"), [("0.9", "IV", True), ("1.1", "IV", False), ("1.1", "force", True)])
+def test_both_ends_of_a_sweep_are_judged_by_rules(last: str, kind: str, *, may: bool) -> None:
+    rule = ForbiddenState("abs(tip-bias-voltage) > 1 V and x-feedback-on", {names.TIP_BIAS_VOLTAGE: "V"})
+    held = Held(LimitChecker(ExperimentLimits(forbid={"rule": rule})))
+    assert set(names.SPEC_ENDS) <= set(held.depends_on(CURVE))
+    assert refused(held, kind, x_spec_from="-0.5", x_spec_to=last) == ""
+    present = PresentState({
+        names.TIP_BIAS_VOLTAGE: (Parameter(names.TIP_BIAS_VOLTAGE, "0.1", "V"),),
+        names.FEEDBACK_ON: (Parameter(names.FEEDBACK_ON, "true"),),
+    })  # fmt: skip
+    assert (held.check_forbidden(CURVE, present) is None) is may

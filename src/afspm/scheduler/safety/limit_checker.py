@@ -126,7 +126,7 @@ class LimitChecker:
 
     def check_values(self, request: Request) -> Response | None:
         """Return the refusal of a treatment of the tip or a curve with the values in force; None: it may start."""
-        if request.subject == names.START_SPEC and request.kind == ControlRequest.ACTION:
+        if self._is_curve(request):
             try:
                 self._check_curve()
             except _Breach as breach:
@@ -143,9 +143,25 @@ class LimitChecker:
 
     def check_forbidden(self, request: Request, present: PresentState) -> Response | None:
         """Return the refusal of a request that leads into a forbidden state; None: it may be sent."""
-        why = forbidden_states.refusal(self.limits, request, present)
+        why = forbidden_states.refusal(self._with_sweep(request), request, present)
         code = ControlResponse.ACTION_ERROR if request.kind == ControlRequest.ACTION else ControlResponse.PARAM_ERROR
         return Response(int(code), b"", why, request.id) if why else None
+
+    def _with_sweep(self, request: Request) -> ExperimentLimits:
+        # a curve that sweeps the bias sets it to both ends; where they are not shown, the bias in force counts
+        kind, ends = self._kind_of_curve(), [self.state.usage.known.get(name) for name in names.SPEC_ENDS]
+        if not self._is_curve(request) or kind not in names.SWEEPS_BIAS or None in ends:
+            return self.limits
+        swept = tuple(Parameter(names.TIP_BIAS_VOLTAGE, repr(end.value), "V") for end in ends if end is not None)
+        return dataclasses.replace(self.limits, sets={**self.limits.sets, names.START_SPEC: swept})
+
+    @staticmethod
+    def _is_curve(request: Request) -> bool:
+        return request.kind == ControlRequest.ACTION and request.subject == names.START_SPEC
+
+    def _kind_of_curve(self) -> str:
+        reported = self.state.last_seen.get(names.SPEC_KIND)
+        return (reported and reported.value) or ""
 
     def outside(self, changed: Parameter) -> str:
         """Return why a value that a person has set lies outside its range or in a forbidden state; empty: neither."""
@@ -176,7 +192,7 @@ class LimitChecker:
             limited = self.limits.parameters
             of_action = _TREATMENTS.get(str(request.subject), ())
             needed += [name for name in of_action if name in limited and limited[name].is_of_a_number]
-            if request.subject == names.START_SPEC:
+            if self._is_curve(request):
                 needed += self._ends_to_read()
         if self.limits.region is not None or is_mapped:
             action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
@@ -444,13 +460,13 @@ class LimitChecker:
 
     def _ends_to_read(self) -> list[str]:
         bias, ends = self._limited_ends()
-        needed = dict.fromkeys((*(names.SPEC_ENDS if bias else ()), *ends))
+        in_rules = any(names.TIP_BIAS_VOLTAGE in rule.names for rule in self.limits.forbid.values())
+        needed = dict.fromkeys((*(names.SPEC_ENDS if bias or in_rules else ()), *ends))
         return [names.SPEC_KIND, *needed] if needed else []
 
     def _check_curve(self) -> None:
         bias, limited = self._limited_ends()
-        reported = self.state.last_seen.get(names.SPEC_KIND)
-        kind = (reported and reported.value) or "of no known kind"
+        kind = self._kind_of_curve() or "of no known kind"
         sweeps_bias, sweeps_height = kind not in names.SWEEPS_HEIGHT, kind not in names.SWEEPS_BIAS
         mine = {*(names.SPEC_ENDS if sweeps_bias else ()), *(names.SPEC_Z_ENDS if sweeps_height else ())}
         ends = mine.intersection((*(names.SPEC_ENDS if bias else ()), *limited))
