@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from afspm.basics.errors import FileError
 from afspm.basics.plain_data import Plain, from_json
 from afspm.model import Frame, Region, Scan, Spectrum
+from afspm.model.caption import SettingInForce
 from afspm.model.variables import VariableRoles
 from afspm.record.spectrum_grid import PointGrid
 from afspm.storage.formats import hdf5_reading
@@ -95,6 +96,8 @@ def _scans(file: h5py.File, about: Plain) -> list[Scan]:
             channel["time_ns"],
             about["filename"],
             roles=tuple(channel.get("roles", ())),
+            in_force=_in_force(about),
+            simulated=bool(about.get("simulated")),
         )
         for channel in about["channels"]
     ]
@@ -114,7 +117,12 @@ def _spectrum(file: h5py.File, about: Plain) -> Spectrum:
         about["filename"],
         Frame(about["frame"]),
         _roles(variables),
+        _in_force(about),
     )
+
+
+def _in_force(about: Plain) -> tuple[SettingInForce, ...]:
+    return tuple(SettingInForce(**one) for one in about.get("in_force", ()))
 
 
 def _roles(variables: Any) -> VariableRoles | None:

@@ -9,7 +9,7 @@ from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 
 from afspm.basics.errors import InvalidValue
-from afspm.model import Region, Scan
+from afspm.model import Region, Scan, stated_settings
 
 mpl.use("Agg")
 VALUES = np.arange(12.0).reshape(3, 4) * 1e-9
@@ -29,6 +29,17 @@ def test_scan_is_drawn_at_its_position(kind: str) -> None:
         assert "1000" in [label.get_text() for label in axes.get_xticklabels()]
     assert isinstance(axes.figure, Figure)
     mpl.pyplot.close(axes.figure)
+
+
+def test_figure_has_its_caption_and_says_that_it_is_simulated() -> None:  # spectra F12
+    in_force = stated_settings({"tip-bias-voltage": (0.1, "V"), "zctrl-setpoint": (2e-11, "A")})
+    scan = Scan(SCAN.region, "Height", "m", VALUES, in_force=in_force, simulated=True)
+    axes, surface = scan.plot(), scan.plot("surface")
+    for one in (axes, surface):
+        assert one.get_title() == "Height\nV = 100 mV, I = 20 pA"
+        assert "SIMULATED" in [text.get_text() for text in one.texts]
+    assert "SIMULATED" not in [text.get_text() for text in SCAN.plot().texts]
+    mpl.pyplot.close("all")
 
 
 def test_scan_over_another_has_its_colours_so_that_the_bar_holds_for_both() -> None:
