@@ -292,6 +292,7 @@ class Scan:
                 "frame": self.region.frame.value,
                 "time": str(self.time),
                 "file": self.filename,
+                "roles": ", ".join(self.roles),
                 **{one.name: one.text for one in self.in_force if one.text},
             },
         )

@@ -198,8 +198,10 @@ class Spectrum:
             import xarray
 
         swept, *rest = self.names
+        role, *roles = self.roles.roles_of(self.names)
         columns: Plain = {
-            name: (swept, self[name], {"units": unit}) for name, unit in zip(rest, self.units[1:], strict=True)
+            name: (swept, self[name], {"units": unit, "role": its})
+            for name, unit, its in zip(rest, self.units[1:], roles, strict=True)
         }
         attributes: dict[str, object] = {
             "kind": self.kind,
@@ -210,7 +212,9 @@ class Spectrum:
         }
         if self.position_m is not None:  # NetCDF has no None
             attributes["position_m"] = self.position_m
-        return xarray.Dataset(columns, {swept: (swept, self[swept], {"units": self.units[0]})}, attributes)
+        return xarray.Dataset(
+            columns, {swept: (swept, self[swept], {"units": self.units[0], "role": role})}, attributes
+        )
 
     def _repr_html_(self) -> str:
         return str(required(DISPLAYS, "spectrum_html")(self))

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 from afspm.basics.errors import ConfigError, NoSuchItem
+from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.model.caption import SPRING_CONSTANT
 
 if TYPE_CHECKING:
@@ -77,6 +78,19 @@ class VariableRoles:
         """Return the role of each variable of a curve; "" for one without a role."""
         found = {self.column(role, present): role for role in self.names}
         return [found.get(name, "") for name in present]
+
+    def listed(self, present: Sequence[str]) -> list[Plain]:
+        """Return role and direction of each variable of a curve, for a file; `from_listed` reads them."""
+        roles = self.roles_of(present)
+        return [{"role": role, "towards": name in self.towards} for name, role in zip(present, roles, strict=True)]
+
+    @classmethod
+    def from_listed(cls, present: Sequence[str], listed: Sequence[PlainMapping]) -> VariableRoles | None:
+        """Return the roles of a curve in a file; None if it is of a version that stored none."""
+        if len(listed) != len(present) or not all("role" in one for one in listed):
+            return None
+        names = {one["role"]: (name,) for name, one in zip(present, listed, strict=True) if one["role"]}
+        return cls(names, tuple(name for name, one in zip(present, listed, strict=True) if one["towards"]))
 
     def refuses(self, *roles: str, read: Collection[str] = ()) -> str:
         """Return why the microscope can't have a variable with one of these roles in its curves; empty if it may.

@@ -126,10 +126,7 @@ def _in_force(about: Plain) -> tuple[SettingInForce, ...]:
 
 
 def _roles(variables: Any) -> VariableRoles | None:
-    if not all("role" in one for one in variables):  # of an earlier version
-        return None
-    names = {one["role"]: (one["name"],) for one in variables if one["role"]}
-    return VariableRoles(names, tuple(one["name"] for one in variables if one["towards"]))
+    return VariableRoles.from_listed([one["name"] for one in variables], variables)
 
 
 def _grid(file: h5py.File, about: Plain) -> Iterator[Spectrum]:
@@ -141,7 +138,7 @@ def _grid(file: h5py.File, about: Plain) -> Iterator[Spectrum]:
         hdf5_reading.array(forward["x"]), hdf5_reading.array(forward["y"]), tuple(about["center_m"]), about["angle_rad"]
     )
     sweep = _there_and_back([hdf5_reading.array(forward[swept["field"]])] * max(len(one["ways"]) for one in columns))
-    times = np.asarray(entry[ABOUT]["time_ns"][()]).astype("datetime64[ns]")
+    times, roles = np.asarray(entry[ABOUT]["time_ns"][()]).astype("datetime64[ns]"), _roles([swept, *columns])
     for row, column in np.ndindex(times.shape):
         curves = [_there_and_back([way[row, column] for way in ways]) for ways in data]
         if np.isnan(curves).all():
@@ -154,6 +151,8 @@ def _grid(file: h5py.File, about: Plain) -> Iterator[Spectrum]:
             np.column_stack([sweep, *curves]),
             None if np.isnat(times[row, column]) else int(times[row, column].astype(np.int64)),
             frame=Frame(about["frame"]),
+            declared_roles=roles,
+            in_force=_in_force(about),
         )
 
 

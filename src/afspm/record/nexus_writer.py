@@ -102,9 +102,9 @@ def encode_spectrum(spectrum: Spectrum, circumstances: FileProvenance) -> bytes:
         "kind": spectrum.kind,
         "measured_ns": spectrum.time_ns,
         "variables": [
-            {"name": name, "unit": unit, "field": one, "role": role, "towards": name in spectrum.roles.towards}
-            for name, unit, one, role in zip(
-                spectrum.names, spectrum.units, fields, spectrum.roles.roles_of(spectrum.names), strict=True
+            {"name": name, "unit": unit, "field": one, **listed}
+            for name, unit, one, listed in zip(
+                spectrum.names, spectrum.units, fields, spectrum.roles.listed(spectrum.names), strict=True
             )
         ],
     }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import matplotlib as mpl
 import numpy as np
 import pytest
@@ -100,12 +102,15 @@ def test_scan_that_can_not_be_drawn_is_refused() -> None:
 @pytest.mark.program
 def test_a_scan_is_the_same_after_a_way_through_sidpy() -> None:
     pytest.importorskip("sidpy", reason="sidpy, a gigabyte, is not installed")
-    dataset = SCAN.to_sidpy()
+    in_force = stated_settings({"tip-bias-voltage": (0.1, "V")})
+    scan = replace(SCAN, roles=("height",), in_force=in_force, simulated=True)
+    dataset = scan.to_sidpy()
     assert dataset.shape == (4, 3)
     assert (dataset.data_type.name, dataset.quantity, dataset.units) == ("IMAGE", "Height", "m")
     assert dataset.x.values[[0, -1]] == pytest.approx((850e-9, 1150e-9))
     assert float(dataset[3, 0]) == VALUES[0, 3]
     back = Scan.from_sidpy(dataset)
+    assert (back.roles, back.in_force, back.simulated) == (("height",), in_force, True)
     assert np.array_equal(back.values, VALUES)
     assert (back.channel, back.unit, back.filename) == ("Height", "m", "a.sxm")
     assert back.region.center_m == pytest.approx(SCAN.region.center_m)
