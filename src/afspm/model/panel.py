@@ -7,7 +7,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 from afspm.basics.formatting import quantity
-from afspm.model.caption import SettingInForce, in_force
+from afspm.model.caption import SettingInForce, caption, in_force
 from afspm.model.requests import Parameter
 
 if TYPE_CHECKING:
@@ -183,3 +183,7 @@ class MeasurementConditions:
         if self.begin_in_force or self.end_in_force:
             return in_force(self.begin_in_force, self.end_in_force)
         return in_force(self.begin_values, self.end_values)
+
+    def caption(self) -> str:
+        """Return the settings in force, "V = 100 mV, I = 20 pA, 5 nm/s"; empty if none is known."""
+        return caption(self.in_force)

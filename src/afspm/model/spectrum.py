@@ -94,6 +94,11 @@ class Spectrum:
         """Return what the variables measure: as declared, or else found by the names that makers are known to use."""
         return self.declared_roles or FOUND_BY_NAME
 
+    def label(self, name: str) -> str:
+        """Return a variable's name for a person, with its role where that differs: "Defl (deflection)"."""
+        (role,) = self.roles.roles_of([name])
+        return f"{name} ({role})" if role and role.casefold() != name.casefold() else name
+
     def of(self, role: str) -> NDArray[np.float64]:
         """Return the values of what a variable measures, in SI, shape (points of this way,).
 
