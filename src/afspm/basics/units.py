@@ -33,6 +33,7 @@ _BASES = {
     "rad": "rad",
     "W": "W",
     "K": "K",
+    "S": "S",
     "Ohm": "ohm",
     "ohm": "ohm",
 }
@@ -243,6 +244,14 @@ def si_unit_or_none(unit: str) -> str | None:
         return None
 
 
+def in_si(value: Number, unit: str) -> tuple[Number, str]:
+    """Return a value in the SI unit of the same kind, and this unit; both unchanged for units like "arb" and "dBm"."""
+    base = si_unit_or_none(unit)
+    if base is None or " " in base:
+        return value, unit
+    return convert(value, unit, base), base
+
+
 def same_kind(unit_a: str, unit_b: str) -> bool:
     """Return whether one unit can be converted to the other; False for unknown units."""
     found = si_unit_or_none(unit_a)
@@ -304,6 +313,7 @@ _SI_NAMES = {
     "ampere": "A",
     "kilogram * meter ** 2 / second ** 3": "W",
     "kilogram * meter ** 2 / ampere ** 2 / second ** 3": "ohm",
+    "ampere ** 2 * second ** 3 / kilogram / meter ** 2": "S",
     "dimensionless": "",
 }
 

@@ -100,7 +100,7 @@ class MessageDispatcher:
         """
         try:
             message = wire.message_of(packet.envelope)
-            thing = view.with_roles(wire.decode(message, packet.payload))
+            thing = view.described(wire.decode(message, packet.payload))
         except WireError as error:
             self._log.warning("a packet can't be read: %s", error)
             return

@@ -92,7 +92,7 @@ class Events(Iterator[PublishedEvent]):
         except WireError as error:
             self._link.log.warning("a packet can't be read: %s", error)
             return None
-        return PublishedEvent(packet.envelope, self._link.view.with_roles(decoded), packet.time_ns)
+        return PublishedEvent(packet.envelope, self._link.view.described(decoded), packet.time_ns)
 
     def close(self) -> None:
         """Drop all waiting messages, and stop collecting new ones."""

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 from afspm import wire
@@ -23,6 +24,7 @@ from afspm.model import (
     ControlMode,
     ControlState,
     Feedback,
+    MeasurementConditions,
     Packet,
     ProbePosition,
     RelayedMessage,
@@ -54,6 +56,10 @@ from afspm.transport.port import (
 )
 from afspm.transport.process.context import ProcessActivity
 from afspm.transport.process.parent import StopRequested
+from afspm.wire.messages import CONDITIONS
+
+_CONDITIONS = 16
+"""Measurements whose conditions are kept: a component may handle the packets of earlier ones."""
 
 
 class PublishedState:
@@ -78,6 +84,8 @@ class PublishedState:
         self._manual_ns = 0
         self._manual_since_ns: int | None = None
         self._published: Counter[str] = Counter()
+        self._conditions: deque[MeasurementConditions] = deque(maxlen=_CONDITIONS)
+        self.simulated = False
 
     @property
     def state(self) -> ScopeState:
@@ -102,9 +110,21 @@ class PublishedState:
         else:
             self._manual_ns, self._manual_since_ns = self.manual_ns(at_ns), None
 
-    def with_roles(self, thing: Any) -> Any:
-        """Return a scan, lines of one, or a curve with the roles of what it measures; any other thing unchanged."""
-        return self.channels.shown(thing) if isinstance(thing, Scan | ScanLines | Spectrum) else thing
+    def take_conditions(self, conditions: MeasurementConditions) -> None:
+        """Store the conditions of a measurement, which are published right before it."""
+        self._conditions.append(conditions)
+
+    def described(self, thing: Any) -> Any:
+        """Return a scan, lines of one, or a curve with the roles of what it measures; any other thing unchanged.
+
+        A scan or curve has the settings in force, too.
+        """
+        shown = self.channels.shown(thing) if isinstance(thing, Scan | ScanLines | Spectrum) else thing
+        if not isinstance(shown, Scan | Spectrum):
+            return shown
+        of_it = next((one for one in reversed(self._conditions) if one.is_of(shown)), None)
+        shown = shown if of_it is None else replace(shown, in_force=of_it.in_force)
+        return replace(shown, simulated=True) if self.simulated and isinstance(shown, Scan) else shown
 
     def take_time(self, time_ns: int | None) -> None:
         """Update `newest_ns` with the time of a packet from the scheduler."""
@@ -236,7 +256,7 @@ class ExperimentLink:
         Args:
             given: name, activity or log, as to the constructor.
         """
-        return cls(
+        link = cls(
             port,
             given.pop("name", launch.name),
             source=launch.sockets.subscribe[0] if launch.sockets.subscribe else None,
@@ -245,6 +265,8 @@ class ExperimentLink:
             request_retries=launch.request_retries,
             **given,
         )
+        link.view.simulated = launch.simulated
+        return link
 
     # --- waiting ---
 
@@ -490,5 +512,7 @@ class ExperimentLink:
             message = wire.message_of(packet.envelope)
             if wire.declaration(message).kind is wire.MessageKind.STATE:
                 self.view.take(message, wire.decode(message, packet.payload))
+            elif message == CONDITIONS.name:
+                self.view.take_conditions(wire.decode(message, packet.payload))
         except WireError as error:
             self.log.debug("a packet can't be read: %s", error)

@@ -153,7 +153,9 @@ class KeyedResults:
             )
         kept = head.get("conditions")  # none in results of an earlier version
         conditions = None if kept is None else wire.decode(CONDITIONS.name, bytes.fromhex(kept))
-        return MeasurementResult([_with_roles(one, head) for one in things], head["interruptions"], conditions)
+        in_force = () if conditions is None else conditions.in_force
+        things = [replace(_with_roles(one, head), in_force=in_force) for one in things]
+        return MeasurementResult(things, head["interruptions"], conditions)
 
     def fulfil(self, key: str, plan: Plain, result: MeasurementResult) -> None:
         """Save the result of the intended measurement. If the disk is full, a restarted component measures again."""
@@ -218,7 +220,7 @@ def check_key(key: str) -> str:
     return key
 
 
-def _with_roles(thing: object, head: Plain) -> object:
+def _with_roles(thing: Any, head: Plain) -> Any:
     if isinstance(thing, Spectrum) and (kept := head.get("variables")) is not None:
         return replace(thing, declared_roles=from_plain(VariableRoles, kept))
     roles = head.get("roles", {})

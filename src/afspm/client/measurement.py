@@ -102,7 +102,7 @@ class _Watch:
                 self._conditions = conditions = wire.decode(name, packet.payload)
                 self.cycle.on_conditions(conditions, packet.time_ns)
             elif name == self._message:
-                found = self._link.view.with_roles(wire.decode(name, packet.payload))
+                found = self._link.view.described(wire.decode(name, packet.payload))
                 self.cycle.on_result(found, packet.time_ns, is_ours=self._is_ours(found))
         except WireError as error:
             self._link.log.warning("a %s can't be read: %s", packet.envelope, error)

@@ -12,7 +12,7 @@ from afspm.basics import typeset_length
 from afspm.basics.errors import InvalidValue
 from afspm.basics.formatting import scale
 from afspm.drawing.image_html import round_length_m
-from afspm.drawing.palette import PALETTES, colour_map
+from afspm.drawing.palette import PALETTES, PROBLEM, colour_map
 from afspm.drawing.raster import ValueRange, value_range
 
 if TYPE_CHECKING:
@@ -105,6 +105,10 @@ def _explain(scan: Scan, drawn: object, axes: Any, label: str, *, colorbar: bool
     for axis, name in ((axes.xaxis, "x"), (axes.yaxis, "y")):
         axis.set_major_formatter(lambda place_m, _: f"{place_m * factor:.6g}".replace("-", "−"))
         axis.set_label_text(f"{name} / {length_unit}")
+    if scan.simulated:
+        box = {"facecolor": "white", "alpha": 0.8, "pad": 1.5, "edgecolor": "none"}
+        look: Any = {"color": PROBLEM, "weight": "bold", "fontsize": 8, "ha": "right", "va": "top", "bbox": box}
+        axes.annotate("SIMULATED", (0.99, 0.99), xycoords="axes fraction", **look)
     if hasattr(axes, "set_zlabel"):
         axes.set_zlabel(label)
         return
@@ -159,4 +163,5 @@ def gold() -> ListedColormap:
 
 
 def _title(scan: Scan) -> str:
-    return f"{scan.channel}, {scan.time:%Y-%m-%d %H:%M:%S} UTC" if scan.time else scan.channel
+    title = f"{scan.channel}, {scan.time:%Y-%m-%d %H:%M:%S} UTC" if scan.time else scan.channel
+    return "\n".join(filter(None, (title, scan.caption())))

@@ -171,7 +171,7 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
             _resolve_plan(process, process.component, resolved, has)
         if has is not None:
             _check_channels(process, process.component, document, has.channels)
-            _check_variables(process, process.component, document, has.channels)
+            _check_variables(process, process.component, document, has)
     speeds = [plan.scan_speed_m_s for plan in resolved.plans.values()]
     usual_m_s = next((speed for speed in speeds if speed is not None), None)
     for name, plan in resolved.plans.items():
@@ -187,12 +187,15 @@ def _check_channels(process: ResolvedProcess, component: type, document: Documen
             document.error(what, process.name, *path, hint=hint)
 
 
-def _check_variables(process: ResolvedProcess, component: type, document: Document, there: ChannelRoles) -> None:
+def _check_variables(
+    process: ResolvedProcess, component: type, document: Document, has: MicroscopeCapabilities
+) -> None:
+    there = has.channels
     needed = getattr(component, "needed_variables", None)
     if needed is None or there.variables is None:
         return
     for roles in needed(process.settings):
-        if reason := there.variables.refuses(*roles):
+        if reason := there.variables.refuses(*roles, read=has.parameters):
             what = f"[{process.name}] needs {' or '.join(roles)} in its curves: {reason}"
             hint = f"they have {', '.join(there.variables.names)}; [microscope.channels] gives further names"
             document.error(what, process.name, hint=hint)

@@ -22,6 +22,7 @@ from afspm.basics.lazy import lazily
 
 if TYPE_CHECKING:
     from afspm.model import parameter_names as names
+    from afspm.model.caption import SENSITIVITY, SPRING_CONSTANT, SettingInForce, stated_settings
     from afspm.model.channels import (
         HEIGHT_RETRACE,
         TOPOGRAPHY,
@@ -105,6 +106,8 @@ __all__ = [
     "RELAY_REQUEST",
     "RESTART_REQUEST",
     "RETRACE",
+    "SENSITIVITY",
+    "SPRING_CONSTANT",
     "STOPPED_BY_AGENT",
     "TOPOGRAPHY",
     "WAIT_FOR_CONTROL",
@@ -165,6 +168,7 @@ __all__ = [
     "ScanSet",
     "ScopeState",
     "ScopeStatus",
+    "SettingInForce",
     "Spectrum",
     "TipStatus",
     "both_ways",
@@ -175,12 +179,14 @@ __all__ = [
     "of_role",
     "registration_summary",
     "request_name",
+    "stated_settings",
 ]
 
 if not TYPE_CHECKING:
     __getattr__ = lazily(
         __name__,
         {
+            "afspm.model.caption": "SENSITIVITY SPRING_CONSTANT SettingInForce stated_settings",
             "afspm.model.channels": "HEIGHT_RETRACE TOPOGRAPHY ChannelName ChannelRoles both_ways of_role",
             "afspm.model.curve_request": "CurveTable curve_parameters",
             "afspm.model.events": (

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from afspm.basics.formatting import quantity
+from afspm.model.caption import SettingInForce, caption, in_force
 from afspm.model.requests import Parameter
+
+if TYPE_CHECKING:
+    from afspm.model.scan import Scan
+    from afspm.model.spectrum import Spectrum
 
 _DIGITS: Final = 7
 """As many as single precision has: many controllers keep their settings in it."""
@@ -152,6 +157,7 @@ class MeasurementConditions:
         holder: the component whose request began it; empty: it was begun at the microscope, or that is not known.
         begin_values, end_values: the settings that the run has set for this measurement.
         unproved: what the controller could have shown of it and did not, in words.
+        begin_in_force, end_in_force: the settings of its caption, set by the run or not.
     """
 
     time_ns: int
@@ -164,3 +170,20 @@ class MeasurementConditions:
     begin_values: tuple[Parameter, ...] = ()
     end_values: tuple[Parameter, ...] = ()
     unproved: tuple[str, ...] = ()
+    begin_in_force: tuple[Parameter, ...] = ()
+    end_in_force: tuple[Parameter, ...] = ()
+
+    def is_of(self, result: Scan | Spectrum) -> bool:
+        """Return whether they are published for a channel of a scan, or a spectrum."""
+        return self.time_ns == result.time_ns or bool(result.filename and self.filename == result.filename)
+
+    @property
+    def in_force(self) -> tuple[SettingInForce, ...]:
+        """The settings of its caption; the settings of the run alone in records of an earlier version."""
+        if self.begin_in_force or self.end_in_force:
+            return in_force(self.begin_in_force, self.end_in_force)
+        return in_force(self.begin_values, self.end_values)
+
+    def caption(self) -> str:
+        """Return the settings in force, "V = 100 mV, I = 20 pA, 5 nm/s"; empty if none is known."""
+        return caption(self.in_force)

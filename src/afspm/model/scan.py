@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 from afspm.basics import NoSuchItem, imports_of_extra, utc_time
 from afspm.basics.entry_points import DISPLAYS, required
 from afspm.basics.errors import InvalidValue
+from afspm.model.caption import SettingInForce, caption
 from afspm.model.geometry import XY, Region, RegionChange
 
 if TYPE_CHECKING:
@@ -109,6 +110,8 @@ class Scan:
         filename: the controller's own file; empty without a file.
         pixels: (rows, columns) of a scan without values; None if unknown.
         roles: what the channel measures, as the microscope's driver declares: "height", "height, retrace", "current" …
+        in_force: bias, setpoint, speed … at begin and end, as far as they are known.
+        simulated: whether the microscope was simulated, as the record of a run knows.
     """
 
     region: Region
@@ -119,6 +122,8 @@ class Scan:
     filename: str = ""
     pixels: tuple[int, int] | None = None
     roles: tuple[str, ...] = ()
+    in_force: tuple[SettingInForce, ...] = ()
+    simulated: bool = False
 
     def __post_init__(self) -> None:
         if self.values.ndim != 2:
@@ -145,6 +150,10 @@ class Scan:
     def time(self) -> datetime | None:
         """Return the end of the scan, UTC; None if unknown."""
         return None if self.time_ns is None else utc_time(self.time_ns)
+
+    def caption(self) -> str:
+        """Return the settings that were in force, "V = 100 mV, I = 20 pA, 5 nm/s"; empty if none is known."""
+        return caption(self.in_force)
 
     def is_of(self, channel: str) -> bool:
         """Return whether a channel, given by its name or role, is this one."""
@@ -216,7 +225,8 @@ class Scan:
     ) -> Axes:
         """Draw the scan with matplotlib; an image or contours get a scale bar, and a colour bar with units.
 
-        Only the first scan drawn into the axes gets these bars.
+        Only the first scan drawn into the axes gets these bars. A new figure has the caption below its title, and a
+        scan of a simulated microscope is marked SIMULATED.
 
         Args:
             kind: "image", "contour" or "surface" (in three dimensions).
@@ -282,6 +292,8 @@ class Scan:
                 "frame": self.region.frame.value,
                 "time": str(self.time),
                 "file": self.filename,
+                "roles": ", ".join(self.roles),
+                **{one.name: one.text for one in self.in_force if one.text},
             },
         )
         if not self.region.angle_rad or not array.size:

@@ -152,7 +152,7 @@ class ScanHistory:
         doing, channel = (ScopeState.SCANNING, result.channel) if isinstance(result, Scan) else (ScopeState.SPEC, "")
         found = self._found(doing, published_ns, result.time_ns, channel) or BegunMeasurement(doing)
         for one in reversed(self.conditions):
-            if one.time_ns == result.time_ns or (result.filename and one.filename == result.filename):
+            if one.is_of(result):
                 # who is in control where a scan is first seen need not have begun it
                 control = None if one.holder and found.began_ns is None else found.control
                 return replace(found, began_ns=one.began_ns or found.began_ns, asked_by=one.holder, control=control)

@@ -11,9 +11,19 @@ from afspm.basics import NoSuchItem, imports_of_extra, utc_time
 from afspm.basics.entry_points import DISPLAYS, required
 from afspm.basics.errors import InvalidValue
 from afspm.basics.plain_data import Plain
-from afspm.basics.units import Number, convert, si_unit_or_none
+from afspm.basics.units import in_si
+from afspm.model.caption import SENSITIVITY, SPRING_CONSTANT, SettingInForce, caption
 from afspm.model.geometry import XY, Frame
-from afspm.model.variables import BIAS, FOUND_BY_NAME, HEIGHT, RETRACE, VariableRoles, turning_point
+from afspm.model.variables import (
+    BIAS,
+    DEFLECTION,
+    FORCE,
+    FOUND_BY_NAME,
+    HEIGHT,
+    RETRACE,
+    VariableRoles,
+    turning_point,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,6 +45,7 @@ class Spectrum:
         filename: the controller's own file; empty without a file.
         frame: coordinate system of the position.
         declared_roles: what the variables measure, as the driver says; None if it does not.
+        in_force: bias, setpoint, lock-in, calibrations … at begin and end, as far as they are known.
 
     Raises:
         InvalidValue: names, units and values do not fit together.
@@ -49,6 +60,7 @@ class Spectrum:
     filename: str = ""
     frame: Frame = Frame.TIP
     declared_roles: VariableRoles | None = field(default=None, repr=False)
+    in_force: tuple[SettingInForce, ...] = field(default=(), repr=False)
 
     def __post_init__(self) -> None:
         if self.values.ndim != 2 or self.values.shape[1] != len(self.names) or len(self.names) != len(self.units):
@@ -73,23 +85,35 @@ class Spectrum:
             raise NoSuchItem(f"no variable {name!r}; there are {', '.join(self.names)}")
         return self.values[:, self.names.index(name)]
 
+    def caption(self) -> str:
+        """Return the settings that were in force, "V = 100 mV, I = 20 pA"; empty if none is known."""
+        return caption(self.in_force)
+
     @property
     def roles(self) -> VariableRoles:
         """Return what the variables measure: as declared, or else found by the names that makers are known to use."""
         return self.declared_roles or FOUND_BY_NAME
+
+    def label(self, name: str) -> str:
+        """Return a variable's name for a person, with its role where that differs: "Defl (deflection)"."""
+        (role,) = self.roles.roles_of([name])
+        return f"{name} ({role})" if role and role.casefold() != name.casefold() else name
 
     def of(self, role: str) -> NDArray[np.float64]:
         """Return the values of what a variable measures, in SI, shape (points of this way,).
 
         Args:
             role: one of `VARIABLES`, for the way there; with ", retrace" for the way back. A height is positive away
-                from the sample; the swept variable of the way back has the order of the way back's points.
+                from the sample; the swept variable of the way back has the order of the way back's points. A force that
+                was not recorded is the deflection times the spring constant, where the measurement knows both.
 
         Raises:
             NoSuchItem: the curve has no such variable, no way back, or its ways are not clear.
         """
         quantity = role.removesuffix(RETRACE)
         is_back = role != quantity
+        if quantity == FORCE and not self._has_column(FORCE):
+            return self._force(role.replace(FORCE, DEFLECTION))
         there, back = (self.roles.column(one, self.names) for one in (quantity, quantity + RETRACE))
         known = [one for one in self.roles.roles_of(self.names) if one]
         lacking = NoSuchItem(f"the curve has no {role!r}", hint=f"it has {', '.join(known)} ({', '.join(self.names)})")
@@ -105,7 +129,7 @@ class Spectrum:
         name = (back or (there if shares else None)) if is_back else there
         if name is None:
             raise lacking
-        values = _in_si(self[name], self.units[self.names.index(name)])[0]
+        values = in_si(self[name], self.units[self.names.index(name)])[0]
         if turn is not None:
             values = values[turn:] if is_back else values[:turn]
         return -values if quantity == HEIGHT and name in self.roles.towards else values
@@ -138,9 +162,32 @@ class Spectrum:
 
     def si_unit_of(self, role: str) -> str:
         """Return the unit in which `of` gives a variable; empty if the curve has none."""
+        if role.removesuffix(RETRACE) == FORCE and not self._has_column(FORCE):
+            return "N" if self.has(role) else ""
         found = (self.roles.column(one, self.names) for one in (role, role.removesuffix(RETRACE)))
         name = next((one for one in found if one is not None), None)
-        return "" if name is None else _in_si(1.0, self.units[self.names.index(name)])[1]
+        return "" if name is None else in_si(1.0, self.units[self.names.index(name)])[1]
+
+    def _has_column(self, quantity: str) -> bool:
+        return any(self.roles.column(one, self.names) for one in (quantity, quantity + RETRACE))
+
+    def _force(self, deflection: str) -> NDArray[np.float64]:
+        # some makers record the deflection alone
+        lacking = f"the curve has no {deflection.replace(DEFLECTION, FORCE)!r}"
+        if not self._has_column(DEFLECTION):
+            raise NoSuchItem(f"{lacking}, and no deflection", hint=f"it has {', '.join(self.names)}")
+        unit = self.si_unit_of(deflection)
+        constants = {SPRING_CONSTANT: "N/m"} | ({} if unit == "m" else {SENSITIVITY: "m/V"})
+        if unit not in ("m", "V"):
+            raise NoSuchItem(f"{lacking}, and its deflection is in {unit or 'no unit'}")
+        factor = 1.0
+        for name, its_unit in constants.items():
+            known = next((one.constant for one in self.in_force if one.name == name and one.unit == its_unit), None)
+            if known is None:
+                what = f"{lacking}, and its {name} in {its_unit} is not known"
+                raise NoSuchItem(what, hint="calibrate the cantilever at the controller")
+            factor *= known
+        return factor * self.of(deflection)
 
     def has(self, role: str) -> bool:
         """Return whether the curve has a variable that measures this."""
@@ -156,28 +203,23 @@ class Spectrum:
             import xarray
 
         swept, *rest = self.names
+        role, *roles = self.roles.roles_of(self.names)
         columns: Plain = {
-            name: (swept, self[name], {"units": unit}) for name, unit in zip(rest, self.units[1:], strict=True)
+            name: (swept, self[name], {"units": unit, "role": its})
+            for name, unit, its in zip(rest, self.units[1:], roles, strict=True)
         }
         attributes: dict[str, object] = {
             "kind": self.kind,
             "frame": self.frame.value,
             "time": str(self.time),
             "file": self.filename,
+            **{one.name: one.text for one in self.in_force if one.text},
         }
         if self.position_m is not None:  # NetCDF has no None
             attributes["position_m"] = self.position_m
-        return xarray.Dataset(columns, {swept: (swept, self[swept], {"units": self.units[0]})}, attributes)
+        return xarray.Dataset(
+            columns, {swept: (swept, self[swept], {"units": self.units[0], "role": role})}, attributes
+        )
 
     def _repr_html_(self) -> str:
         return str(required(DISPLAYS, "spectrum_html")(self))
-
-
-def _in_si(value: Number, unit: str) -> tuple[Number, str]:
-    # units that are no SI unit with a prefix ("arb", "dBm") stay; siemens are not taken apart
-    if unit.endswith("S") and (as_current := si_unit_or_none(f"{unit[:-1]}A")) == "A":
-        return convert(value, f"{unit[:-1]}A", as_current), "S"
-    base = si_unit_or_none(unit)
-    if base is None or " " in base:
-        return value, unit
-    return convert(value, unit, base), base

@@ -7,11 +7,13 @@ then the sweep is split where it turns (`turning_point`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 from afspm.basics.errors import ConfigError, NoSuchItem
+from afspm.basics.plain_data import Plain, PlainMapping
+from afspm.model.caption import SPRING_CONSTANT
 
 if TYPE_CHECKING:
     from afspm.model.arrays import Array
@@ -24,9 +26,10 @@ FREQUENCY_SHIFT: Final = "frequency shift"
 BIAS: Final = "bias"
 CONDUCTANCE: Final = "conductance"
 FORCE: Final = "force"
+DEFLECTION: Final = "deflection"
 TIME: Final = "time"
 VARIABLES: Final = (
-    BIAS, HEIGHT, CURRENT, CONDUCTANCE, FORCE, "deflection", FREQUENCY_SHIFT, "amplitude", "phase", "excitation", TIME,
+    BIAS, HEIGHT, CURRENT, CONDUCTANCE, FORCE, DEFLECTION, FREQUENCY_SHIFT, "amplitude", "phase", "excitation", TIME,
 )  # fmt: skip
 """What the variables of curves measure; each is a role for the way there, and with `RETRACE` for the way back."""
 _LEAST_TURN: Final = 0.05
@@ -40,13 +43,17 @@ class VariableRoles:
     Attributes:
         names: the microscope's names of each role; a curve has one of them at most.
         towards: of these, the heights that grow towards the sample.
+        states: what each curve's file states of the cantilever: `SPRING_CONSTANT`, `SENSITIVITY`.
     """
 
     names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     towards: tuple[str, ...] = ()
+    states: tuple[str, ...] = ()
 
     @classmethod
-    def declared(cls, names: Mapping[str, Sequence[str]], towards: Sequence[str] = ()) -> VariableRoles:
+    def declared(
+        cls, names: Mapping[str, Sequence[str]], towards: Sequence[str] = (), states: Sequence[str] = ()
+    ) -> VariableRoles:
         """Return the roles that a driver declares.
 
         Raises:
@@ -56,7 +63,7 @@ class VariableRoles:
             if role.removesuffix(RETRACE) not in VARIABLES:
                 hint = f"one of {', '.join(VARIABLES)}, or one of them with {RETRACE!r}"
                 raise ConfigError(f"there is no role {role!r} of a variable", where="variables", hint=hint)
-        return cls({role: tuple(those) for role, those in names.items()}, tuple(towards))
+        return cls({role: tuple(those) for role, those in names.items()}, tuple(towards), tuple(states))
 
     def changed(self, given: Mapping[str, tuple[str, ...]]) -> VariableRoles:
         """Return the roles, with the experiment file's names before the driver's: scans may share a role."""
@@ -72,15 +79,37 @@ class VariableRoles:
         found = {self.column(role, present): role for role in self.names}
         return [found.get(name, "") for name in present]
 
-    def refuses(self, *roles: str) -> str:
+    def listed(self, present: Sequence[str]) -> list[Plain]:
+        """Return role and direction of each variable of a curve, for a file; `from_listed` reads them."""
+        roles = self.roles_of(present)
+        return [{"role": role, "towards": name in self.towards} for name, role in zip(present, roles, strict=True)]
+
+    @classmethod
+    def from_listed(cls, present: Sequence[str], listed: Sequence[PlainMapping]) -> VariableRoles | None:
+        """Return the roles of a curve in a file; None if it is of a version that stored none."""
+        if len(listed) != len(present) or not all("role" in one for one in listed):
+            return None
+        names = {one["role"]: (name,) for name, one in zip(present, listed, strict=True) if one["role"]}
+        return cls(names, tuple(name for name, one in zip(present, listed, strict=True) if one["towards"]))
+
+    def refuses(self, *roles: str, read: Collection[str] = ()) -> str:
         """Return why the microscope can't have a variable with one of these roles in its curves; empty if it may.
 
-        Whether both ways are in one column is seen in the curves alone, so that the way back counts as there.
+        Whether both ways are in one column is seen in the curves alone, so that the way back counts as there. A force
+        follows from the deflection with a known spring constant.
+
+        Args:
+            read: the microscope's parameters, which are read for each curve.
         """
         quantities = [role.removesuffix(RETRACE) for role in roles]
         if not self.names.keys().isdisjoint((*roles, *quantities)):
             return ""
-        return f"its curves have no {' or '.join(quantities)}"
+        why = f"its curves have no {' or '.join(quantities)}"
+        if FORCE not in quantities:
+            return why
+        lacking = [] if {DEFLECTION, DEFLECTION + RETRACE} & self.names.keys() else [DEFLECTION]
+        lacking += [] if SPRING_CONSTANT in {*self.states, *read} else [f"spring constant ({SPRING_CONSTANT}, in N/m)"]
+        return f"{why}, and no {' and no '.join(lacking)} to derive it from" if lacking else ""
 
 
 FOUND_BY_NAME: Final = VariableRoles.declared(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -12,10 +13,10 @@ from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from afspm import wire
 from afspm.basics import NoSuchItem
-from afspm.basics.errors import FileError, UnitError, WireError
+from afspm.basics.errors import FileError, WireError
 from afspm.basics.plain_data import from_json
-from afspm.basics.units import convert, si_unit
 from afspm.model import Frame, Parameter, Region, RegistrationOutcome, Spectrum, component_of, names
+from afspm.model.caption import value_of
 from afspm.model.events import MeasurementSettings
 from afspm.night.bad_scans import last_scores
 from afspm.night.tables import ScanRow, SpectrumRow, SweptSetting, Table
@@ -168,7 +169,7 @@ def read_scans(
     for row in rows_of_scans:
         registration, sd_m = positions.get(row[0], (None, None))
         rows.append(scan_row(row, keys.get(row[0], ""), registration, sd_m, scores.get(row[1])))
-    rows = _with_instruments(query, "scans", rows, readings, bands)
+    rows = _in_force(query, _with_instruments(query, "scans", rows, readings, bands))
     return KeyedTable(_with_settings(query, "scans", rows), ScanRow)
 
 
@@ -178,7 +179,7 @@ def read_spectra(
     rows_of_spectra = query("SELECT * FROM spectra ORDER BY number")
     keys = _keys(query, "spectra", rows_of_spectra)
     rows = [spectrum_row(row, keys.get(row[0], "")) for row in rows_of_spectra]
-    rows = _with_instruments(query, "spectra", rows, readings, bands)
+    rows = _in_force(query, _with_instruments(query, "spectra", rows, readings, bands))
     return SpectrumTable(_with_settings(query, "spectra", rows), read)
 
 
@@ -241,6 +242,36 @@ def _with_settings(query: Query, table: str, rows: list[R]) -> list[R]:
     return [replace(row, settings=made.get(row.number, ())) for row in rows]
 
 
+def _in_force(query: Query, rows: list[R]) -> list[R]:
+    from afspm.record.provenance import setpoint_in_force
+
+    conditions = [one for _, one in _messages(query, "MeasurementConditions")]
+    by_time = {one.time_ns: one for one in conditions}
+    by_file = {one.filename: one for one in conditions if one.filename}
+    feedback, units = _messages(query, "ZCtrlParameters"), _messages(query, "ZCtrlUnits")
+    made = []
+    for row in rows:
+        of_it = by_time.get(row.time_ns) or by_file.get(row.filename)
+        found = () if of_it is None else of_it.in_force
+        if not found and row.began_ns is not None:
+            found = setpoint_in_force(_latest(feedback, row.began_ns), _latest(units, row.began_ns))
+        made.append(replace(row, in_force=found))
+    return made
+
+
+def _messages(query: Query, message: str) -> list[tuple[int, Any]]:
+    found = []
+    for time_ns, payload in query(f"SELECT time_ns, payload FROM packets WHERE message = '{message}' ORDER BY time_ns"):
+        with suppress(WireError):  # of a newer version
+            found.append((time_ns, wire.decode(message, payload)))
+    return found
+
+
+def _latest(messages: list[tuple[int, Any]], time_ns: int) -> object:
+    at = bisect_right(messages, time_ns, key=itemgetter(0))
+    return messages[at - 1][1] if at else None
+
+
 def _changed_by_hand(query: Query) -> list[tuple[int, str]]:
     acts = []
     for time_ns, payload in query("SELECT time_ns, payload FROM packets WHERE message = 'ActByHand'"):
@@ -267,17 +298,7 @@ def _with_instruments(
 
 
 def _swept(parameter: Parameter) -> SweptSetting:
-    text, unit = parameter.value or "", parameter.unit or ""
-    if text.lower() in ("true", "false"):
-        return SweptSetting(parameter.name, text.lower() == "true", "")
-    try:
-        number = float(text)
-    except ValueError:
-        return SweptSetting(parameter.name, text, "")
-    with suppress(UnitError):  # a unit of the maker's own stays
-        plain = si_unit(unit) if unit else ""
-        return SweptSetting(parameter.name, float(f"{convert(number, unit, plain):.9g}"), plain)
-    return SweptSetting(parameter.name, number, unit)
+    return SweptSetting(parameter.name, *value_of(parameter))
 
 
 def _describe_keys(keys: Sequence[str]) -> str:

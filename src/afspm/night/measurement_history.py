@@ -67,7 +67,7 @@ class ScanSummary:
 
 @dataclass(frozen=True, slots=True)
 class SpectrumSummary:
-    """A spectrum, without its values. `position_m` is (x, y) in `frame`; None if unknown."""
+    """A spectrum, without its values. `position_m` is (x, y) in `frame`; None if unknown. `roles`: "" for no role."""
 
     time_ns: int
     kind: str
@@ -77,6 +77,7 @@ class SpectrumSummary:
     units: tuple[str, ...]
     filename: str = ""
     holder: str | None = None
+    roles: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,7 +234,7 @@ class MeasurementHistory:
         measured_ns = spectrum.time_ns or time_ns
         summary = SpectrumSummary(
             measured_ns, spectrum.kind, spectrum.position_m, spectrum.frame, spectrum.names, spectrum.units,
-            spectrum.filename, holder,
+            spectrum.filename, holder, tuple(spectrum.roles.roles_of(spectrum.names)),
         )  # fmt: skip
         _keep(self._spectra, (measured_ns, spectrum.kind, spectrum.position_m), summary)
 

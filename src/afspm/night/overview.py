@@ -445,8 +445,8 @@ class Overview:
         self._measured.add_scan(scan, time_ns, self._story.of(scan, time_ns), self._holder, outside)
 
     def _on_spectrum(self, spectrum: Spectrum, time_ns: int) -> None:
-        begun = self._story.of(spectrum, time_ns)
-        self._measured.add_spectrum(spectrum, time_ns, begun.holder if begun.number or begun.asked_by else self._holder)
+        begun, shown = self._story.of(spectrum, time_ns), self.channels.shown(spectrum)
+        self._measured.add_spectrum(shown, time_ns, begun.holder if begun.number or begun.asked_by else self._holder)
 
     def _on_instrument_readings(self, report: InstrumentReadings, time_ns: int) -> None:
         for one in report.readings:

@@ -15,10 +15,11 @@ from afspm.basics import imports_of_extra
 from afspm.basics.errors import InvalidValue
 from afspm.basics.units import convert
 from afspm.model.arrays import Array
+from afspm.model.caption import SettingInForce
 from afspm.model.geometry import Frame, Region
 from afspm.model.scan import Scan
 from afspm.model.spectrum import Spectrum
-from afspm.model.variables import RETRACE, VARIABLES
+from afspm.model.variables import RETRACE, VARIABLES, VariableRoles
 from afspm.night.netcdf_encoding import fit_classic_netcdf
 from afspm.record.spectrum_grid import DIRECTIONS, PointGrid, alike, at, columns_of, common_sweep, grid, repeats, ways
 
@@ -43,6 +44,8 @@ class SpectrumStack:
         names: the measured columns of each spectrum, without the swept column.
         columns: columns of each variable, as from `columns_of`.
         times: times of measurement, shape (y, x, repeat); NaT if unknown.
+        roles: of the swept variable and the columns.
+        in_force: the settings that were the same for all curves.
     """
 
     kind: str
@@ -57,6 +60,13 @@ class SpectrumStack:
     names: tuple[str, ...]
     columns: Sequence[Mapping[str, str]]
     times: NDArray[np.datetime64]
+    roles: VariableRoles
+    in_force: tuple[SettingInForce, ...] = ()
+
+    def role_of(self, column: str) -> str:
+        """Return the role of the swept variable or a column; empty without a role."""
+        (role,) = self.roles.roles_of([column])
+        return role
 
     def to_xarray(self) -> xarray.Dataset:
         """Return the arrays with their coordinates (needs the extra `xarray`).
@@ -66,15 +76,22 @@ class SpectrumStack:
         with imports_of_extra("xarray", "stacking spectra"):
             import xarray
 
-        points = self.points
+        points, role = self.points, self.role_of(self.swept_name)
         stack = xarray.Dataset(
-            {name: (DIMENSIONS, values, {"units": self.units[name]}) for name, values in self.curves.items()},
+            {
+                name: (DIMENSIONS, values, {"units": self.units[name], "role": self.role_of(self.columns[0][name])})
+                for name, values in self.curves.items()
+            },
             {
                 "y": ("y", points.y_m, {"units": "m"}),
                 "x": ("x", points.x_m, {"units": "m"}),
                 "repeat": range(self.times.shape[2]),
                 "direction": list(self.directions),
-                "z": ("z", self.swept, {"long_name": self.swept_name, "units": self.swept_unit}),
+                "z": (
+                    "z",
+                    self.swept,
+                    {"long_name": self.swept_name, "units": self.swept_unit, "role": role},
+                ),
                 "time": (DIMENSIONS[:3], self.times),
             },
             {
@@ -82,6 +99,7 @@ class SpectrumStack:
                 "frame": self.frame.value,
                 "angle_rad": points.angle_rad,
                 "center_m": points.center_m,
+                **{one.name: one.text for one in self.in_force if one.text},
             },
         )
         if points.angle_rad:
@@ -125,6 +143,8 @@ def stacked(spectra: Sequence[Spectrum], *, interpolate: bool = False) -> Spectr
         first.names[1:],
         columns,
         times,
+        first.roles,
+        tuple(one for one in first.in_force if all(one in other.in_force for other in spectra)),
     )
 
 

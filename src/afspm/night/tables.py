@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar, over
 from afspm.basics import imports_of_extra
 from afspm.basics.formatting import day_and_time, quantity, scale
 from afspm.model import ControlState, Frame, ProcessCondition, Region, RegistrationOutcome
+from afspm.model.caption import SettingInForce, caption
 from afspm.model.geometry import XY
 
 if TYPE_CHECKING:
@@ -67,6 +68,9 @@ class ScanRow:
         key: the key of the request, `scope.scan(…, key="tile-1")`; empty without a key.
         registration: how the position of the scan on the sample is known; None without drift correction.
         position_sd_m: standard deviation of the position along its most uncertain axis; None if unknown.
+        in_force: bias, setpoint, speed, feedback, lock-in and calibrations as they were in force; a column for each
+            with the value at the begin, "tip-bias-voltage [V]", and "tip-bias-voltage.end [V]" where another value was
+            found at the end. No value: not known.
         settings: parameters that a sweep had set for the scan, as the microscope reported them; a column for each.
             Without each that a person changed at the microscope before its end.
         tip_score: the last verdict on the tip: 1 good, 0.5 unclear, 0 bad; None if the scan was not judged.
@@ -94,6 +98,11 @@ class ScanRow:
     tip_score: float | None = None
     instruments: tuple[InstrumentValue, ...] = ()
     outside: tuple[str, ...] = ()
+    in_force: tuple[SettingInForce, ...] = ()
+
+    def caption(self) -> str:
+        """Return the settings in force, "V = 100 mV, I = 20 pA, 5 nm/s"; empty if none is known."""
+        return caption(self.in_force)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +127,11 @@ class SpectrumRow:
     settings: tuple[SweptSetting, ...] = ()
     instruments: tuple[InstrumentValue, ...] = ()
     outside: tuple[str, ...] = ()
+    in_force: tuple[SettingInForce, ...] = ()
+
+    def caption(self) -> str:
+        """Return the settings in force, "V = 100 mV, I = 20 pA"; empty if none is known."""
+        return caption(self.in_force)
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,8 +259,8 @@ _COLUMNS = {
     "rate_m_s": ("rate_x_m_s", "rate_y_m_s"),
 }
 """Attributes that are split into several columns."""
-_WITH_OWN_COLUMNS = frozenset({"settings", "instruments"})
-"""The attributes with columns for each parameter of a sweep, or of an instrument."""
+_WITH_OWN_COLUMNS = frozenset({"in_force", "settings", "instruments"})
+"""The attributes with columns for each parameter that was in force or swept, or of an instrument."""
 
 
 def _names(kind: type) -> list[str]:
@@ -255,8 +269,11 @@ def _names(kind: type) -> list[str]:
 
 
 def _own_columns(row: Any) -> dict[str, object]:
-    swept = {one.column: one.value for one in getattr(row, "settings", ())}
-    return swept | {name: value for one in getattr(row, "instruments", ()) for name, value in one.columns.items()}
+    found: dict[str, object] = {}
+    for one in getattr(row, "in_force", ()):
+        found |= one.columns
+    found |= {one.column: one.value for one in getattr(row, "settings", ())}
+    return found | {name: value for one in getattr(row, "instruments", ()) for name, value in one.columns.items()}
 
 
 def _apart(row: Any) -> dict[str, object]:

@@ -225,6 +225,7 @@ class MeasuredFiles:
         found = {
             "instruments": provenance.instruments(self._journal, published_ns, since_ns, self._speed),
             "tip": provenance.tip(self._journal, published_ns, since_ns, filenames, measured_ns),
+            "in_force": provenance.in_force(self._journal, published_ns, since_ns, filenames, measured_ns),
         }
         return {name: facts for name, facts in found.items() if facts}
 

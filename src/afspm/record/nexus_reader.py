@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from afspm.basics.errors import FileError
 from afspm.basics.plain_data import Plain, from_json
 from afspm.model import Frame, Region, Scan, Spectrum
+from afspm.model.caption import SettingInForce
 from afspm.model.variables import VariableRoles
 from afspm.record.spectrum_grid import PointGrid
 from afspm.storage.formats import hdf5_reading
@@ -95,6 +96,8 @@ def _scans(file: h5py.File, about: Plain) -> list[Scan]:
             channel["time_ns"],
             about["filename"],
             roles=tuple(channel.get("roles", ())),
+            in_force=_in_force(about),
+            simulated=bool(about.get("simulated")),
         )
         for channel in about["channels"]
     ]
@@ -114,14 +117,16 @@ def _spectrum(file: h5py.File, about: Plain) -> Spectrum:
         about["filename"],
         Frame(about["frame"]),
         _roles(variables),
+        _in_force(about),
     )
 
 
+def _in_force(about: Plain) -> tuple[SettingInForce, ...]:
+    return tuple(SettingInForce(**one) for one in about.get("in_force", ()))
+
+
 def _roles(variables: Any) -> VariableRoles | None:
-    if not all("role" in one for one in variables):  # of an earlier version
-        return None
-    names = {one["role"]: (one["name"],) for one in variables if one["role"]}
-    return VariableRoles(names, tuple(one["name"] for one in variables if one["towards"]))
+    return VariableRoles.from_listed([one["name"] for one in variables], variables)
 
 
 def _grid(file: h5py.File, about: Plain) -> Iterator[Spectrum]:
@@ -133,7 +138,7 @@ def _grid(file: h5py.File, about: Plain) -> Iterator[Spectrum]:
         hdf5_reading.array(forward["x"]), hdf5_reading.array(forward["y"]), tuple(about["center_m"]), about["angle_rad"]
     )
     sweep = _there_and_back([hdf5_reading.array(forward[swept["field"]])] * max(len(one["ways"]) for one in columns))
-    times = np.asarray(entry[ABOUT]["time_ns"][()]).astype("datetime64[ns]")
+    times, roles = np.asarray(entry[ABOUT]["time_ns"][()]).astype("datetime64[ns]"), _roles([swept, *columns])
     for row, column in np.ndindex(times.shape):
         curves = [_there_and_back([way[row, column] for way in ways]) for ways in data]
         if np.isnan(curves).all():
@@ -146,6 +151,8 @@ def _grid(file: h5py.File, about: Plain) -> Iterator[Spectrum]:
             np.column_stack([sweep, *curves]),
             None if np.isnat(times[row, column]) else int(times[row, column].astype(np.int64)),
             frame=Frame(about["frame"]),
+            declared_roles=roles,
+            in_force=_in_force(about),
         )
 
 

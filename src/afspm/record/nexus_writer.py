@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from afspm.basics.clock import iso_utc
 from afspm.basics.plain_data import Plain, PlainMapping
-from afspm.model import Scan, Spectrum
+from afspm.model import Scan, SettingInForce, Spectrum, names
 from afspm.model.arrays import Array
 from afspm.record import nxspm
 from afspm.record.nexus_reader import ABOUT, BIAS_SPECTRUM, DEFINITION, VENDOR, about_of
@@ -102,9 +102,9 @@ def encode_spectrum(spectrum: Spectrum, circumstances: FileProvenance) -> bytes:
         "kind": spectrum.kind,
         "measured_ns": spectrum.time_ns,
         "variables": [
-            {"name": name, "unit": unit, "field": one, "role": role, "towards": name in spectrum.roles.towards}
-            for name, unit, one, role in zip(
-                spectrum.names, spectrum.units, fields, spectrum.roles.roles_of(spectrum.names), strict=True
+            {"name": name, "unit": unit, "field": one, **listed}
+            for name, unit, one, listed in zip(
+                spectrum.names, spectrum.units, fields, spectrum.roles.listed(spectrum.names), strict=True
             )
         ],
     }
@@ -121,7 +121,7 @@ def encode_spectrum(spectrum: Spectrum, circumstances: FileProvenance) -> bytes:
             column = np.ascontiguousarray(spectrum.values[:, number])
             values(data, name, column, spectrum.units[number], spectrum.names[number])
         if definition == BIAS_SPECTRUM:
-            nxspm.write_bias_sweep(entry, instrument, spectrum)
+            nxspm.write_bias_sweep(entry, instrument, spectrum, _bias_v(about))
         else:
             nxspm.write_point(instrument, spectrum)
 
@@ -156,6 +156,7 @@ def _encoded(
         fill(entry, nxspm.describe(entry, definition, about, afspm_version()))
         collection = group(entry, ABOUT, "NXcollection")
         put(collection, "about", json.dumps(about))
+        _write_in_force(collection, about)
         shown: PlainMapping = about
         mark(collection, **{name: shown[name] for name in _SHOWN if shown.get(name) is not None})
         if circumstances.header:
@@ -165,6 +166,28 @@ def _encoded(
         # HDF5 reserves 256 bytes for the header of each new field, and a copy has what the field needs: 4 kB less
         aside.copy(entry, file)
     return content.getvalue()
+
+
+def _write_in_force(collection: h5py.Group, about: PlainMapping) -> None:
+    # each setting as a field of its own, for programs that read no JSON; the end only where it differs
+    if not (settings := [SettingInForce(**one) for one in about.get("in_force", ())]):
+        return
+    made = group(collection, "in_force", "NXcollection")
+    for one in settings:
+        ends = {"": one.begin} | ({} if one.end == one.begin else {"_end": one.end})
+        for suffix, value in ends.items():
+            name = f"{one.name.replace('-', '_')}{suffix}"
+            if isinstance(value, float | int) and not isinstance(value, bool):
+                values(made, name, float(value), one.unit)
+            elif value is not None:
+                put(made, name, value)
+
+
+def _bias_v(about: PlainMapping) -> float | None:
+    # while the height was controlled, before the sweep
+    found = (SettingInForce(**one) for one in about.get("in_force", ()))
+    value = next((one.begin for one in found if one.name == names.TIP_BIAS_VOLTAGE), None)
+    return value if isinstance(value, float) else None
 
 
 def _in_single_precision(numbers: Array) -> NDArray[np.floating]:

@@ -76,7 +76,10 @@ def write_point(instrument: h5py.Group, spectrum: Spectrum) -> None:
         _write_pattern(instrument, spectrum.position_m, None, (1, 1))
 
 
-def write_bias_sweep(entry: h5py.Group, instrument: h5py.Group, spectrum: Spectrum) -> None:
+def write_bias_sweep(
+    entry: h5py.Group, instrument: h5py.Group, spectrum: Spectrum, bias_v: float | None = None
+) -> None:
+    """Write the sweep of a bias spectrum; `bias_v`: the bias between sweeps, None if it is not known."""
     put(entry, "scan_mode", "constant height")  # the feedback is held while the bias is swept
     environment = group(instrument, "bias_spectroscopy_environment", "NXenvironment")
     spectroscopy = group(environment, "bias_spectroscopy", "NXspm_bias_spectroscopy")
@@ -90,7 +93,8 @@ def write_bias_sweep(entry: h5py.Group, instrument: h5py.Group, spectrum: Spectr
     region = group(sweep, "scan_region", "NXspm_scan_region")
     values(region, "scan_start_bias", first, "V")
     values(region, "scan_end_bias", last, "V")
-    values(region, "scan_offset_bias", first, "V")
+    if bias_v is not None:
+        values(region, "scan_offset_bias", bias_v, "V")
     values(region, "scan_range_bias", abs(last - first), "V")
     linear = group(sweep, "linear_sweep", "NXspm_scan_pattern")
     put(linear, "scan_points_bias", count)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from afspm import wire
@@ -26,7 +26,11 @@ from afspm.model import (
     ScopeStatus,
     Spectrum,
     TipStatus,
+    names,
 )
+from afspm.model.caption import SettingInForce
+from afspm.model.caption import in_force as in_force_of
+from afspm.model.state import FeedbackUnits
 from afspm.record.drift_mapping import drift_knowledge
 from afspm.record.instrument_values import RecordedReadings, earliest_ns
 
@@ -88,6 +92,28 @@ def control_at_start(journal: sqlite3.Connection, time_ns: int, result: Scan | S
         feedback if isinstance(feedback, Feedback) else None,
         asked_by,
     )
+
+
+def in_force(
+    journal: sqlite3.Connection, time_ns: int, began_ns: int | None, filenames: Collection[str], measured_ns: int
+) -> list[Plain]:
+    """Return the settings in force at the begin and end of a measurement, as facts; see `SettingInForce`.
+
+    A translator of another implementation publishes none: then the setpoint alone is known, at the begin.
+    """
+    conditions = _conditions(journal, time_ns, filenames, measured_ns)
+    found = () if conditions is None else conditions.in_force
+    if not found and began_ns is not None:
+        found = setpoint_in_force(_last(journal, "ZCtrlParameters", began_ns), _last(journal, "ZCtrlUnits", began_ns))
+    return [asdict(one) for one in found]
+
+
+def setpoint_in_force(feedback: object, units: object) -> tuple[SettingInForce, ...]:
+    """Return the setpoint of the published feedback, if its unit was published, too."""
+    if not isinstance(feedback, Feedback) or feedback.setpoint is None:
+        return ()
+    unit = units.setpoint if isinstance(units, FeedbackUnits) else ""
+    return in_force_of((Parameter(names.ZCTRL_SETPOINT, repr(feedback.setpoint), unit),), ())
 
 
 def _conditions(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
-from afspm.model import ActByHand, MeasurementConditions, Parameter, Request, TipStatus, names
+from afspm.basics.errors import InvalidValue, Refused
+from afspm.model import ActByHand, MeasurementConditions, Parameter, Request, ScopeState, TipStatus, names
+from afspm.model.caption import captioned
 from afspm.translator.driver_base import DriverBase
 from afspm.translator.judge import Claim, ResultVerdict, Stated, Witness, judge
 from afspm.translator.parameters import FEEDBACK_ON, Value
@@ -30,6 +32,7 @@ class Claims:
         self._driver = driver
         self._kept = kept.setdefault("claims", {"next": {}, "asked": None, "running": None, "contradicted": ""})
         self._end: dict[str, Value] = {}
+        self._end_in_force: dict[str, Value] = {}
         self._tip: TipStatus | None = None
         self.repeated = ""
         self._beyond = ""
@@ -69,7 +72,8 @@ class Claims:
         """
         holder = request.id.partition("/")[0] or "a program without a name"
         coming = dict(self._kept["next"])
-        claim = Claim(0, holder, values=coming, begin=self._read(coming))
+        shown = self._of_caption(of_scan=request.subject == names.START_SCAN)
+        claim = Claim(0, holder, values=coming, begin=self._read(coming), in_force=self._read_shown(shown))
         if request.subject == names.START_SCAN and values.keys() >= {*FRAME} - {names.SCAN_ANGLE}:
             region, shape = frame(values)
             claim = replace(claim, frame=region, shape=shape)
@@ -79,13 +83,21 @@ class Claims:
         """Note that the measurement asked for was not begun."""
         self._kept["asked"] = None
 
-    def begin(self, began_ns: int, tip: TipStatus) -> None:
-        """Note that a measurement has begun, perhaps asked for by an earlier process of this translator."""
+    def begin(self, began_ns: int, tip: TipStatus, doing: ScopeState, values: Mapping[str, Value]) -> None:
+        """Note that a measurement has begun, perhaps asked for by an earlier process of this translator.
+
+        Args:
+            values: the settings at the last reading.
+        """
         asked, self._kept["asked"] = self._kept["asked"], None
         claim = Claim(began_ns, tip=tip)
         if asked is not None:
             claim = replace(Claim.of(asked), began_ns=began_ns, tip=tip)
             self._kept["next"] = {}
+        else:  # at the panel; a spectrum sweeps its settings by now
+            is_scan = doing is ScopeState.SCANNING
+            known = values if is_scan else {}
+            claim = replace(claim, in_force={name: known.get(name) for name in self._of_caption(of_scan=is_scan)})
         self._kept["running"] = claim.kept()
 
     def end(self) -> None:
@@ -101,6 +113,7 @@ class Claims:
         """
         claim = self.running or Claim(0)
         self._tip, self._end = tip, {} if tip is None else self._read(claim.values)
+        self._end_in_force = {} if tip is None else self._read_shown(claim.in_force)
         witness = Witness(None if withdrew else tip, self._differences(claim, self._end))
         verdicts = [judge(claim, witness, one) for one in stated or [Stated()]]
         found = next((one for one in verdicts if one.rule), verdicts[0])
@@ -136,7 +149,19 @@ class Claims:
             self._parameters({name: claim.begin.get(name, value) for name, value in claim.values.items()}),
             self._parameters(self._end),
             tuple(unproved),
+            self._parameters({name: value for name, value in claim.in_force.items() if value is not None}),
+            self._parameters(self._end_in_force),
         )
+
+    def _of_caption(self, *, of_scan: bool) -> list[str]:
+        return captioned(self._driver.table, of_scan=of_scan)
+
+    def _read_shown(self, wanted: Collection[str]) -> dict[str, Value]:
+        try:
+            return self._driver.in_force(list(wanted)) if wanted else {}
+        except (InvalidValue, Refused) as error:  # a caption is no reason to refuse or lose a measurement
+            self._driver.log.debug("the settings of a caption are left out: %s", error)
+            return {}
 
     def _read(self, wanted: Mapping[str, Value]) -> dict[str, Value]:
         return self._driver.in_force(list(wanted)) if wanted else {}

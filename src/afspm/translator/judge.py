@@ -62,6 +62,7 @@ class Claim:
         tip: at its begin; None: not read.
         values: the settings that the run has set for it, as read back then, in SI.
         begin: the same settings at its begin.
+        in_force: the settings of its caption at its begin, whether or not the run has set them; None: not known.
         frame, shape: of a scan, right before it was asked for; None: not known.
     """
 
@@ -72,6 +73,7 @@ class Claim:
     begin: Mapping[str, Value] = field(default_factory=dict)
     frame: Region | None = None
     shape: tuple[int, int] | None = None
+    in_force: Mapping[str, Value | None] = field(default_factory=dict)
 
     def kept(self) -> dict[str, Any]:
         tip = None if self.tip is None else [self.tip.engaged, self.tip.feedback_on]
@@ -83,12 +85,14 @@ class Claim:
             "begin": dict(self.begin),
             "frame": None if self.frame is None else as_list(self.frame),
             "shape": self.shape,
+            "in_force": dict(self.in_force),
         }
 
     @classmethod
     def of(cls, kept: Mapping[str, Any]) -> Claim:
         tip = None if kept["tip"] is None else TipStatus(*kept["tip"])
         claim = cls(kept["began_ns"], kept["holder"], tip, kept["values"], kept["begin"])
+        claim = replace(claim, in_force=kept.get("in_force", {}))
         if kept.get("frame") is None:  # a process of an earlier version kept none
             return claim
         rows, columns = kept["shape"]

@@ -440,7 +440,7 @@ class Observer:
 
     def _note_state(self, state: ScopeState, time_ns: int) -> None:
         if state in MEASURING and self.claims.running is None:
-            self.claims.begin(time_ns, self.panel.tip)
+            self.claims.begin(time_ns, self.panel.tip, state, self.values)
             self._is_after_spectrum = state is ScopeState.SPEC
             self._acts = []
         elif state is ScopeState.FREE:

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 from afspm.basics.errors import AfspmError
 from afspm.basics.plain_data import Plain
-from afspm.model import MeasurementConditions, Scan, ScopeState, Spectrum
+from afspm.model import MeasurementConditions, Parameter, Scan, ScopeState, Spectrum
+from afspm.model.caption import as_parameters
 from afspm.translator.driver_base import DriverBase
 from afspm.translator.judge import Stated
 from afspm.wire import encode
@@ -31,12 +33,13 @@ class Outgoing(NamedTuple):
 
 
 class _Loaded(NamedTuple):
-    """A result as messages, with the kind, the time and the file of its measurement."""
+    """A result as messages, with the kind, the time and the file of its measurement, and calibrations of this file."""
 
     messages: list[tuple[str, bytes]]
     kind: ScopeState
     time_ns: int | None
     filename: str
+    stated: tuple[Parameter, ...]
 
 
 class Outbox:
@@ -115,7 +118,8 @@ class Outbox:
         for result, loaded in self._read.items():
             # one time each: subscribers recognise a duplicate by its time
             times = self._stamp(1 + len(loaded.messages))
-            told = encode(conditions(times[0] if loaded.time_ns is None else loaded.time_ns, loaded.filename))
+            of_it = conditions(times[0] if loaded.time_ns is None else loaded.time_ns, loaded.filename)
+            told = encode(_with_stated(of_it, loaded.stated))
             packets += _packets([told, *loaded.messages], times)
             self._kept["known"].append(result)
             sent = {"result": result, "times": times, "conditions": told[1].hex()}
@@ -137,13 +141,22 @@ class Outbox:
             first_ns = next((one.time_ns for one in found if one.time_ns is not None), None)
             filename = next((one.filename for one in found if one.filename), result)
             kind = ScopeState.SCANNING if any(isinstance(one, Scan) for one in found) else ScopeState.SPEC
-            return _Loaded([encode(one) for one in found], kind, first_ns, filename)
+            stated = as_parameters(found[0].in_force) if found else ()
+            return _Loaded([encode(one) for one in found], kind, first_ns, filename, stated)
         except Exception as error:  # a reader may raise anything; a bad file must not end the process
             if result not in self._complained:
                 why = error if isinstance(error, AfspmError | OSError) else f"{type(error).__name__}: {error}"
                 self._log.warning("%s can't be read yet: %s; retrying", result, why)
                 self._complained.add(result)
             return None
+
+
+def _with_stated(conditions: MeasurementConditions, stated: tuple[Parameter, ...]) -> MeasurementConditions:
+    # what was read of the controller counts more than what its file states
+    known = {one.name for one in (*conditions.begin_in_force, *conditions.end_in_force)}
+    new = tuple(one for one in stated if one.name not in known)
+    begin, end = conditions.begin_in_force, conditions.end_in_force
+    return replace(conditions, begin_in_force=(*begin, *new), end_in_force=(*end, *new))
 
 
 def _packets(messages: list[tuple[str, bytes]], times: list[int]) -> list[Outgoing]:

@@ -6,16 +6,20 @@ fetched; `read_netcdf` reads them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import tzinfo
+from itertools import count
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
 from afspm.basics.clock import NS_PER_S, utc_time
 from afspm.basics.errors import FileError
 from afspm.model import Region, Scan, Spectrum, names
+from afspm.model.channels import ROLES_APART
+from afspm.model.variables import VariableRoles
 from afspm.storage.formats import hdf5_reading, netcdf
 from afspm.storage.formats.content import FileContent, OtherFormat
 from afspm.storage.formats.netcdf import Attributes, File, Variable
@@ -38,17 +42,28 @@ class FileFacts:
     attributes: Attributes
 
 
-def encode_scan(region: Region, channels: Mapping[str, tuple[str, np.ndarray]], facts: FileFacts) -> bytes:
-    """Return a scan file with a variable over (y, x) per channel; axes of the unrotated frame."""
+def encode_scan(
+    region: Region,
+    channels: Mapping[str, tuple[str, np.ndarray]],
+    facts: FileFacts,
+    roles: Mapping[str, Sequence[str]] = MappingProxyType({}),
+) -> bytes:
+    """Return a scan file with a variable over (y, x) per channel; axes of the unrotated frame.
+
+    Args:
+        channels: unit and values of each channel.
+        roles: of each channel, as in `Scan.roles`.
+    """
     rows, columns = next(iter(channels.values()))[1].shape
     (left, low), (width, height) = region.top_left_m, region.size_m
     variables = {
         "y": Variable(("y",), np.linspace(low, low + height, rows), {"units": "m"}),
         "x": Variable(("x",), np.linspace(left, left + width, columns), {"units": "m"}),
     }
-    for channel, (unit, values) in channels.items():
-        attributes: Attributes = {"long_name": channel, "units": unit}
-        variables[_identifier(channel)] = Variable(("y", "x"), values, attributes)
+    for name, (channel, (unit, values)) in zip(_identifiers(channels, variables), channels.items(), strict=True):
+        attributes: dict[str, str | float] = {"long_name": channel, "units": unit}
+        its = {"roles": ROLES_APART.join(roles[channel])} if roles.get(channel) else {}
+        variables[name] = Variable(("y", "x"), values, attributes | its)
     where = {
         "region_center_x_m": region.center_m[0],
         "region_center_y_m": region.center_m[1],
@@ -61,10 +76,12 @@ def encode_scan(region: Region, channels: Mapping[str, tuple[str, np.ndarray]], 
 
 def encode_spectrum(spectrum: Spectrum, facts: FileFacts) -> bytes:
     """Return a spectrum file: a variable over (point) per measured quantity, in their order."""
-    variables = {}
-    for number, (name, unit) in enumerate(zip(spectrum.names, spectrum.units, strict=True)):
-        attributes: Attributes = {"long_name": name, "units": unit}
-        variables[_identifier(name)] = Variable(("point",), spectrum.values[:, number], attributes)
+    variables, listed = {}, spectrum.roles.listed(spectrum.names)
+    for number, identifier in enumerate(_identifiers(spectrum.names)):
+        its = listed[number]
+        attributes: dict[str, str | float] = {"long_name": spectrum.names[number], "units": spectrum.units[number]}
+        attributes |= {"role": its["role"]} | ({"positive": "down"} if its["towards"] else {})
+        variables[identifier] = Variable(("point",), spectrum.values[:, number], attributes)
     where: dict[str, str | float] = {"kind": spectrum.kind}
     if spectrum.position_m is not None:
         where |= {"position_x_m": spectrum.position_m[0], "position_y_m": spectrum.position_m[1]}
@@ -77,9 +94,16 @@ def _header(content: str, facts: FileFacts) -> dict[str, str | float]:
     return {"Conventions": CONVENTIONS, "content": content, "time": when, "time_ns": str(facts.time_ns)}
 
 
-def _identifier(name: str) -> str:
-    # not every reader of NetCDF takes spaces or non-ASCII characters; the attribute `long_name` has the real name
-    return "".join(c if c.isascii() and c.isalnum() else "_" for c in name).lower()
+def _identifiers(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
+    # not every reader of NetCDF takes spaces or non-ASCII characters; the attribute `long_name` has the real name. Two
+    # signals of a controller may have the same name.
+    found, used = list[str](), set(taken)
+    for name in names:
+        plain = "".join(c if c.isascii() and c.isalnum() else "_" for c in name).lower()
+        free = (one for number in count(1) if (one := plain if number == 1 else f"{plain}_{number}") not in used)
+        found.append(next(free))
+        used.add(found[-1])
+    return found
 
 
 def read_netcdf(path: Path, zone: tzinfo | None) -> FileContent:
@@ -140,6 +164,7 @@ def _scans(file: File, end_ns: int, path: Path) -> tuple[Scan, ...]:
             variable.values,
             end_ns,
             str(path),
+            roles=tuple(filter(None, str(variable.attributes.get("roles", "")).split(ROLES_APART))),
         )
         for name, variable in file.variables.items()
         if name not in _AXES
@@ -151,12 +176,19 @@ def _spectrum(file: File, end_ns: int, path: Path) -> Spectrum:
     if "position_x_m" in file.attributes:
         position = (float(file.attributes["position_x_m"]), float(file.attributes["position_y_m"]))
     variables = list(file.variables.values())
+    found = tuple(str(variable.attributes["long_name"]) for variable in variables)
+    listed = [
+        {"role": one.attributes["role"], "towards": one.attributes.get("positive") == "down"}
+        for one in variables
+        if "role" in one.attributes
+    ]
     return Spectrum(
         position,
         str(file.attributes["kind"]),
-        tuple(str(variable.attributes["long_name"]) for variable in variables),
+        found,
         tuple(str(variable.attributes["units"]) for variable in variables),
         np.stack([variable.values for variable in variables], axis=1),
         end_ns,
         str(path),
+        declared_roles=VariableRoles.from_listed(found, listed),
     )

@@ -359,6 +359,8 @@ MAPPINGS: tuple[MessageMapping[Any], ...] = (
         begin_values=_each("begin_values", PARAMETER),
         end_values=_each("end_values", PARAMETER),
         unproved=FieldMapping("unproved", from_wire=tuple),
+        begin_in_force=_each("begin_in_force", PARAMETER),
+        end_in_force=_each("end_in_force", PARAMETER),
     ),
     GRANT,
     MessageMapping(model.Approvals, grants_pb2.Approvals, approvals=_each("approvals", _APPROVAL)),

@@ -18,6 +18,7 @@ from afspm.model import (
     ControlRequest,
     ControlResponse,
     Feedback,
+    MeasurementConditions,
     ProbePosition,
     Region,
     Scan,
@@ -27,6 +28,7 @@ from afspm.model import (
     Spectrum,
     names,
 )
+from afspm.plugins.asylum import Asylum
 from afspm.plugins.asylum.emulator.wire import CallFailed
 
 Make = Callable[..., Bench]
@@ -560,6 +562,14 @@ def test_force_curve_has_its_position(bench: Make) -> None:
     note = str(binarywave.load(curve.filename)["wave"]["note"], "latin-1")
     noted = dict(line.split(": ", 1) for line in note.split("\r") if ": " in line)
     assert (noted["ImagingMode"], noted["TriggerChannel"]) == ("Contact", "DeflVolts")
+    (conditions,) = [one for one in received if isinstance(one, MeasurementConditions)]
+    in_force = {one.name: one.constant for one in conditions.in_force}
+    assert in_force["x-spring-constant"] == pytest.approx(float(noted["SpringConstant"]))
+    assert in_force["x-sensitivity"] == pytest.approx(float(noted["InvOLS"]))
+    assert (in_force["tip-bias-voltage"], names.SCAN_SPEED in in_force) == (0.0, False)
+    (from_file,) = read(curve.filename).spectra
+    force_n = Asylum.channels_of({}).shown(from_file).of("force, retrace")
+    assert force_n == pytest.approx(float(noted["SpringConstant"]) * deflection[len(deflection) // 2 :], abs=1e-11)
     for name in (
         "NumPtsPerSec",
         "TriggerPoint",

@@ -390,6 +390,9 @@ def test_a_spectrum_is_drawn_with_those_before_it_behind() -> None:
     values = np.stack([np.linspace(-1, 1, 50), np.linspace(0, 1e-9, 50)], axis=1)
     spectra = [(i * S, Spectrum((0.0, 0.0), "IV", ("V", "I"), ("V", "A"), values, i * S)) for i in range(1, 4)]
     chart = spectrum_chart(spectra, "I")
+    named = [(S, Spectrum(None, "force", ("ZSnsr", "Defl"), ("m", "m"), np.ones((3, 2)), S))]
+    axes = spectrum_chart(named, "Defl").options or {}
+    assert (axes["xAxis"]["name"], axes["yAxis"]["name"]) == ("ZSnsr (height) / m", "Defl (deflection) / m")
     assert chart.options is not None
     assert len(lines(chart.options)) == 3
     assert [one["lineStyle"].get("opacity") for one in chart.options["series"]] == [0.4, 0.4, 1.0]

@@ -84,6 +84,7 @@ def test_a_night_by_http_alone_is_in_the_record_under_its_name(started: Started)
     told = looker.get(f"/spectra/{curve['result']}")
     assert told["position_m"] == pytest.approx([1e-7, 0.0], abs=2e-8)
     assert np.load(io.BytesIO(looker.get("/spectra/newest/values"))).shape[1] == len(told["variables"])
+    assert told["variables"][0]["role"] == "bias"
     soon = ada.ask("POST", "/spectra", {"key": "soon"})  # contributors K1
     assert (soon.status, soon.code) == (429, "too-soon")
     assert soon.body["again"] > looker.get("/state")["time"]

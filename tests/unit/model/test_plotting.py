@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import matplotlib as mpl
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 
 from afspm.basics.errors import InvalidValue
-from afspm.model import Region, Scan
+from afspm.model import Region, Scan, stated_settings
 
 mpl.use("Agg")
 VALUES = np.arange(12.0).reshape(3, 4) * 1e-9
@@ -29,6 +31,17 @@ def test_scan_is_drawn_at_its_position(kind: str) -> None:
         assert "1000" in [label.get_text() for label in axes.get_xticklabels()]
     assert isinstance(axes.figure, Figure)
     mpl.pyplot.close(axes.figure)
+
+
+def test_figure_has_its_caption_and_says_that_it_is_simulated() -> None:  # spectra F12
+    in_force = stated_settings({"tip-bias-voltage": (0.1, "V"), "zctrl-setpoint": (2e-11, "A")})
+    scan = Scan(SCAN.region, "Height", "m", VALUES, in_force=in_force, simulated=True)
+    axes, surface = scan.plot(), scan.plot("surface")
+    for one in (axes, surface):
+        assert one.get_title() == "Height\nV = 100 mV, I = 20 pA"
+        assert "SIMULATED" in [text.get_text() for text in one.texts]
+    assert "SIMULATED" not in [text.get_text() for text in SCAN.plot().texts]
+    mpl.pyplot.close("all")
 
 
 def test_scan_over_another_has_its_colours_so_that_the_bar_holds_for_both() -> None:
@@ -89,12 +102,15 @@ def test_scan_that_can_not_be_drawn_is_refused() -> None:
 @pytest.mark.program
 def test_a_scan_is_the_same_after_a_way_through_sidpy() -> None:
     pytest.importorskip("sidpy", reason="sidpy, a gigabyte, is not installed")
-    dataset = SCAN.to_sidpy()
+    in_force = stated_settings({"tip-bias-voltage": (0.1, "V")})
+    scan = replace(SCAN, roles=("height",), in_force=in_force, simulated=True)
+    dataset = scan.to_sidpy()
     assert dataset.shape == (4, 3)
     assert (dataset.data_type.name, dataset.quantity, dataset.units) == ("IMAGE", "Height", "m")
     assert dataset.x.values[[0, -1]] == pytest.approx((850e-9, 1150e-9))
     assert float(dataset[3, 0]) == VALUES[0, 3]
     back = Scan.from_sidpy(dataset)
+    assert (back.roles, back.in_force, back.simulated) == (("height",), in_force, True)
     assert np.array_equal(back.values, VALUES)
     assert (back.channel, back.unit, back.filename) == ("Height", "m", "a.sxm")
     assert back.region.center_m == pytest.approx(SCAN.region.center_m)

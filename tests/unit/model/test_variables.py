@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from afspm.basics import ConfigError, NoSuchItem
-from afspm.model import Spectrum
+from afspm.model import Spectrum, stated_settings
 from afspm.model.channels import ChannelRoles
 from afspm.model.variables import VariableRoles, turning_point
 from afspm.plugins.asylum import Asylum
@@ -48,15 +48,62 @@ def test_pull_off_is_the_same_on_each_maker(maker: str) -> None:  # spectra F0
     assert lowest == pytest.approx(Z_M[int(np.argmin(BACK_N))])
 
 
-def test_height_of_asylum_is_turned_away_from_the_sample_and_has_no_force() -> None:
+def test_height_of_asylum_is_turned_away_from_the_sample() -> None:
     extension = np.r_[Z_M[::-1], Z_M].max() - np.r_[Z_M[::-1], Z_M]
     values = np.stack([extension, np.r_[THERE_N[::-1], BACK_N] / 0.4, extension], axis=1)
     found = Asylum.channels_of({}).shown(Spectrum(None, "force", ("Raw", "Defl", "ZSnsr"), ("m",) * 3, values))
     assert np.all(np.diff(found.of("height")) < 0), "it approaches"
     assert np.all(np.diff(found.of("height, retrace")) > 0)
     assert found.of("deflection, retrace").min() == pytest.approx(BACK_N.min() / 0.4)
-    with pytest.raises(NoSuchItem, match="no 'force'"):
-        found.of("force")
+
+
+def deflection_of_asylum(unit: str, values: np.ndarray, **calibration: tuple[float, str]) -> Spectrum:
+    extension = np.r_[Z_M[::-1], Z_M].max() - np.r_[Z_M[::-1], Z_M]
+    stated = stated_settings({f"x-{name.replace('_', '-')}": one for name, one in calibration.items()})
+    name = "Defl" if unit == "m" else "DeflV"
+    columns = np.stack([extension, values], axis=1)
+    curve = Spectrum(None, "force", ("ZSnsr", name), ("m", unit), columns, in_force=stated)
+    return Asylum.channels_of({}).shown(curve)
+
+
+def test_force_is_the_deflection_times_the_spring_constant() -> None:  # spectra F0
+    deflection_m = np.r_[THERE_N[::-1], BACK_N] / 0.4
+    found = deflection_of_asylum("m", deflection_m, spring_constant=(0.4, "N/m"))
+    assert found.of("force, retrace") == pytest.approx(BACK_N)
+    assert found.of("force") == pytest.approx(THERE_N[::-1])
+    assert (found.si_unit_of("force, retrace"), found.has("force")) == ("N", True)
+    volts = deflection_of_asylum("V", deflection_m / 60e-9, spring_constant=(0.4, "N/m"), sensitivity=(60e-9, "m/V"))
+    assert volts.of("force, retrace") == pytest.approx(BACK_N)
+
+
+@pytest.mark.parametrize(
+    ("unit", "calibration", "lacks"),
+    [
+        ("m", {}, "x-spring-constant in N/m is not known"),
+        ("m", {"spring_constant": (0.4, "")}, "x-spring-constant in N/m is not known"),
+        ("V", {"spring_constant": (0.4, "N/m")}, "x-sensitivity in m/V is not known"),
+        ("arb", {"spring_constant": (0.4, "N/m")}, "its deflection is in arb"),
+    ],
+)
+def test_force_without_a_calibration_is_refused(
+    unit: str, calibration: dict[str, tuple[float, str]], lacks: str
+) -> None:
+    found = deflection_of_asylum(unit, np.r_[THERE_N[::-1], BACK_N], **calibration)
+    assert not found.has("force, retrace")
+    assert found.si_unit_of("force, retrace") == ""
+    with pytest.raises(NoSuchItem, match=f"no 'force, retrace', and .*{lacks}"):
+        found.of("force, retrace")
+
+
+def test_check_refuses_a_force_without_a_spring_constant() -> None:
+    asylum = Asylum.channels_of({}).variables
+    assert asylum is not None
+    assert asylum.refuses("force, retrace") == ""
+    unknown = VariableRoles.declared({"deflection": ["Defl"]})
+    assert "no spring constant (x-spring-constant, in N/m) to derive it from" in unknown.refuses("force, retrace")
+    assert unknown.refuses("force, retrace", read=["x-spring-constant"]) == ""
+    assert "no deflection and no spring constant" in VariableRoles.declared({"bias": ["Bias"]}).refuses("force")
+    assert asylum.refuses("bias") == "its curves have no bias"
 
 
 def test_way_back_is_never_replaced_by_the_way_there() -> None:

@@ -38,7 +38,8 @@ def test_curves_lie_where_they_were_measured() -> None:
     assert back.values == pytest.approx(8 * BIAS)
     assert list(arrays.direction.values) == ["forward", "backward"]
     assert arrays.Current.attrs["units"] == "A"
-    assert arrays.z.attrs == {"long_name": "Bias", "units": "V"}
+    assert arrays.z.attrs == {"long_name": "Bias", "units": "V", "role": "bias"}
+    assert arrays.Current.attrs["role"] == "current"
     assert arrays.attrs["kind"] == "IV"
 
 

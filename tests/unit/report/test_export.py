@@ -162,6 +162,7 @@ def test_spectra_of_a_grid_are_one_nexus_file(night: Night, store: RecordStore, 
         assert list(data.attrs["axes"]) == ["y", "x", "bias"]
         assert data[data.attrs["signal"]][:, :, 20] == pytest.approx(np.array([[1, 2, 3], [4, 5, 6]]))
         assert data["x"][:].tolist() == pytest.approx([0.0, 2e-9, 4e-9])
+        assert [data[name].attrs["role"] for name in ("bias", "current")] == ["bias", "current"]
 
 
 ONE_WAY = np.linspace(-1.0, 2.0, 30)
@@ -190,6 +191,7 @@ def test_file_of_a_grid_is_read_as_the_spectra_of_the_run(
         assert (one.kind, one.names, one.units, one.frame) == (own.kind, own.names, own.units, own.frame)
         assert (one.time_ns, one.position_m) == (own.time_ns, pytest.approx(own.position_m, abs=1e-15))
         assert one.values == pytest.approx(own.values)
+        assert one.roles.roles_of(one.names) == own.roles.roles_of(own.names)
 
 
 def test_damaged_spectrum_is_missing_in_the_grid(night: Night, store: RecordStore, tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from afspm.model import (
     ControlResponse,
     JournalEntries,
     JournalEntry,
+    MeasurementConditions,
     PanelAct,
     Parameter,
     Scan,
@@ -25,6 +26,7 @@ from afspm.model import (
 )
 from afspm.model.events import MeasurementSettings
 from afspm.model.panel import ChangedValue
+from afspm.model.state import FeedbackUnits
 from afspm.night.tables import SweptSetting
 from afspm.record.store import RecordStore
 from afspm.report.export import export
@@ -68,6 +70,48 @@ def test_key_leads_to_the_whole_scan_after_a_run_was_cut_off_in_it(
     assert [(row.key, row.interrupted) for row in run.scans] == [("tile-1", True), ("tile-1", False)]
     assert run.scan("tile-1").first.filename == "scan-0001.nc"
     assert (run.scans[0].time_ns, run.scans[0].began_ns) == (ended_ns, ended_ns - 1_000_000)
+
+
+def conditions(night: Night, filename: str, begin: tuple[Parameter, ...], end: tuple[Parameter, ...] = ()) -> Given:
+    found = MeasurementConditions(night.now_ns, filename, begin_in_force=begin, end_in_force=end or begin)
+    return night.packet(found)
+
+
+BIAS, LOCK_IN = Parameter("tip-bias-voltage", "0.1", "V"), Parameter("x-lock-in-amplitude", "0.01", "V")
+
+
+def test_settings_in_force_are_columns_and_fields_of_the_file(
+    night: Night, store: RecordStore, tmp_path: Path
+) -> None:  # spectra F10
+    pytest.importorskip("xarray")
+    scanning = night.state(ScopeState.SCANNING)
+    changed = (BIAS, Parameter("tip-bias-voltage", "50", "mV"))
+    store.take([scanning, conditions(night, "scan-0001.nc", changed[:1], changed[1:]), *night.whole_scan(1)[1:]])
+    store.take([conditions(night, "s", (BIAS, LOCK_IN)), night.spectrum()])
+    run = afspm.open_run(tmp_path)
+    columns = run.scans.columns()
+    assert (columns["tip-bias-voltage [V]"], columns["tip-bias-voltage.end [V]"]) == ([0.1], [0.05])
+    assert run.scans[0].caption() == run.scan(0).first.caption() == "V = 100 mV → 50 mV"
+    assert run.scan(0).first.to_xarray().attrs["tip-bias-voltage"] == "100 mV → 50 mV"
+    assert run.spectra.to_pandas()["x-lock-in-amplitude [V]"].tolist() == [0.01]
+    assert run.spectrum(0).caption() == "V = 100 mV, lock-in amplitude = 10 mV"
+    with h5py.File(tmp_path / run.scans[0].file) as file:
+        fields = file["entry/afspm/in_force"]
+        assert {name: (one[()], one.attrs["units"]) for name, one in fields.items()} == {
+            "tip_bias_voltage": (0.1, "V"),
+            "tip_bias_voltage_end": (0.05, "V"),
+        }
+
+
+def test_settings_of_another_implementation_are_those_of_its_states(
+    night: Night, store: RecordStore, tmp_path: Path
+) -> None:
+    units = night.packet(FeedbackUnits("", "", "V"))
+    store.take([units, night.feedback(), night.state(ScopeState.FREE), *night.whole_scan(1)])
+    run = afspm.open_run(tmp_path)
+    assert run.scans.columns()["zctrl-setpoint [V]"] == [0.75]
+    assert run.scan(0).first.caption() == "setpoint = 750 mV"
+    assert "tip-bias-voltage [V]" not in run.scans.columns()
 
 
 def test_record_without_keys_is_named_in_the_error(night: Night, store: RecordStore, tmp_path: Path) -> None:

@@ -13,7 +13,18 @@ from hypothesis import strategies as st
 from record_lab import ABOUT, Night
 
 import afspm
-from afspm.model import ChannelRoles, Frame, Region, Scan, ScanSet, ScopeState, Spectrum
+from afspm.model import (
+    ChannelRoles,
+    Frame,
+    MeasurementConditions,
+    Parameter,
+    Region,
+    Scan,
+    ScanSet,
+    ScopeState,
+    Spectrum,
+)
+from afspm.model.variables import VariableRoles
 from afspm.night.run import Run
 from afspm.record.store import RecordStore
 from afspm.report.export import export, gwyddion, netcdf
@@ -111,6 +122,37 @@ def test_exported_spectrum_is_read_as_it_was_measured(to: str, measured: Spectru
     np.testing.assert_array_equal(found.values, measured.values)
     assert (found.names, found.units, found.kind) == (measured.names, measured.units, measured.kind)
     assert (found.time_ns, found.filename) == (measured.time_ns, measured.filename)
+
+
+@pytest.mark.parametrize("to", ["h5", "nc"])
+def test_roles_and_settings_in_force_are_kept_in_an_export(
+    to: str, night: Night, store: RecordStore, tmp_path: Path
+) -> None:
+    roles = VariableRoles.declared({"height": ["Ext"], "deflection": ["D"]}, towards=["Ext"])
+    values = np.column_stack((np.linspace(0.0, 1.0, 5), np.ones(5)))
+    curve = Spectrum((0.0, 0.0), "force", ("Ext", "D"), ("um", "nm"), values, night.now_ns, "a.ibw")
+    stiff = (Parameter("x-spring-constant", "0.4", "N/m"),)
+    conditions = MeasurementConditions(night.now_ns, "a.ibw", begin_in_force=stiff, end_in_force=stiff)
+    store.take([night.packet(ChannelRoles(variables=roles)), night.packet(conditions), night.packet(curve, "Spec1d_f")])
+    with afspm.open_run(tmp_path) as run:
+        (found,) = exported(run, to, tmp_path).spectra
+    assert found.of("height") == pytest.approx(-np.linspace(0.0, 1e-6, 5))
+    assert found.of("force") == pytest.approx(0.4e-9)
+    assert found.caption() == "k = 0.4 N/m"
+
+
+def test_exported_scan_is_read_by_others_with_its_roles(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    xarray = pytest.importorskip("xarray")
+    bias = (Parameter("tip-bias-voltage", "0.1", "V"),)
+    conditions = MeasurementConditions(night.now_ns + 2_000_000, "scan-0001.nc", begin_in_force=bias)
+    roles = ChannelRoles({"height": ("Height",)})
+    store.take([night.packet(roles), night.packet(conditions), *night.whole_scan(1)])
+    with afspm.open_run(tmp_path) as run:
+        (path,) = (path for path in export(run, "nc", tmp_path / "out") if path.name.startswith("0001"))
+        (first, _) = afspm.read(path).scans
+    assert (first.roles, first.caption(), first.simulated) == (("height",), "V = 100 mV", True)
+    with xarray.open_dataset(path) as others:
+        assert others["height"].attrs["roles"] == "height"
 
 
 @FEW

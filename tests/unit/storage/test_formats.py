@@ -141,6 +141,24 @@ def test_a_bias_spectrum_of_nanonis(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("status", "caption"), [("ON", "lock-in amplitude = 5 mV, lock-in frequency = 727 Hz"), ("OFF", "")]
+)
+def test_lock_in_of_nanonis_is_in_force(status: str, caption: str, tmp_path: Path) -> None:
+    lock_in = {
+        "Lock-in status": status,
+        "Modulated signal": "Bias (V)",
+        "Frequency (Hz)": "727E+0",
+        "Amplitude": "5E-3",
+    }
+    spectrum = "".join(f"Lock-in>{name}\t{value}\t\r\n" for name, value in lock_in.items()).encode()
+    scan = "".join(f":Lock-in>{name}:\n{value}\n" for name, value in lock_in.items()).encode()
+    (tmp_path / "a.dat").write_bytes(samples.dat().replace(b"[DATA]", spectrum + b"\r\n[DATA]"))
+    (tmp_path / "a.sxm").write_bytes(samples.sxm().replace(b":SCANIT_END:", scan + b":SCANIT_END:"))
+    assert afspm.read(tmp_path / "a.dat", zone=UTC).spectra[0].caption() == caption
+    assert afspm.read(tmp_path / "a.sxm", zone=UTC).scans[0].caption() == caption
+
+
+@pytest.mark.parametrize(
     ("column", "name", "unit"),
     [
         ("Current PSD (A/sqrt(Hz))", "Current PSD", "A/sqrt(Hz)"),

@@ -11,12 +11,13 @@ import gwyfile
 import numpy as np
 import pytest
 from deadlines import DEADLINE_S
-from PIL import Image
+from PIL import Image, TiffImagePlugin
 from pspylib import tiff
 
 import afspm
 from afspm.basics.errors import FileError
 from afspm.model import Feedback, Region
+from afspm.plugins.park import file_header
 from afspm.plugins.park.emulator import files
 from afspm.simulation.activities import RETRACE, ScanActivity, SpectrumActivity
 
@@ -90,6 +91,22 @@ def test_a_curve_is_read_there_and_back(kind: str, names: tuple[str, ...], tmp_p
     there, back = (SWEPT[::-1], SWEPT) if kind == "force" else (SWEPT, SWEPT[::-1])
     np.testing.assert_allclose(curve.values[:, 0], [*there, *back], atol=1e-13)
     np.testing.assert_allclose(curve.values[:, 1], [*there, *(back + 1e-9)], atol=1e-13)
+    assert curve.in_force == (), "its header states no calibration"
+
+
+def test_curve_states_the_calibration_of_its_cantilever(tmp_path: Path) -> None:
+    path = curve_file(tmp_path, "force")
+    with Image.open(path) as image:
+        assert isinstance(image, TiffImagePlugin.TiffImageFile)
+        raw = bytes(image.tag_v2[file_header.CURVES_TAG])
+    header = np.frombuffer(raw[: file_header.CURVES.itemsize], file_header.CURVES).copy()
+    header["spring_n_per_m"], header["sensitivity_v_per_um"] = 0.4, 20.0
+    path.write_bytes(path.read_bytes().replace(raw, header.tobytes() + (raw[file_header.CURVES.itemsize :])))
+    (curve,) = afspm.read(path).spectra
+    assert {one.name: (one.constant, one.unit) for one in curve.in_force} == {
+        "x-spring-constant": (pytest.approx(0.4), "N/m"),
+        "x-sensitivity": (pytest.approx(50e-9), "m/V"),
+    }
 
 
 def test_curves_that_are_not_whole_are_refused(tmp_path: Path) -> None:

@@ -72,6 +72,25 @@ def test_a_result_has_its_begin_its_holder_and_its_settings(bench: Any, scan: An
     ] * 2
 
 
+def test_a_result_has_the_settings_of_its_caption_at_both_ends(bench: Any, scan: Any) -> None:  # spectra F10
+    assert scan_it(bench, scan, "1", during={"Bias": 300.0})[-2:] == ["Scan2d", "FREE"]
+    (found,) = [one for one in bench.beside if isinstance(one, MeasurementConditions)]
+    assert not found.begin_values, "the run has set nothing"
+    bias = next(one for one in found.in_force if one.name == names.TIP_BIAS_VOLTAGE)
+    assert bias.columns == {"tip-bias-voltage [V]": 0.1, "tip-bias-voltage.end [V]": 0.3}
+    assert names.SCAN_SPEED in {one.name for one in found.in_force}
+
+
+def test_a_setting_that_cannot_be_read_costs_its_caption_alone(make_bench: Any, scan: Any) -> None:
+    bench = make_bench({"parameters": {"x-lock-in-amplitude": {"vendor": "Lock", "unit": "V"}}})
+    bench.microscope.values["Lock"] = 0.01
+    bench.look()
+    assert scan_it(bench, scan, "1", during={"Lock": math.nan})[-2:] == ["Scan2d", "FREE"]
+    (found,) = [one for one in bench.beside if isinstance(one, MeasurementConditions)]
+    assert "x-lock-in-amplitude" in {one.name for one in found.begin_in_force}
+    assert not found.end_in_force
+
+
 # results C1: 78 of 78 curves without feedback were complete
 @pytest.mark.parametrize("off_at", ["begin", "during"])
 def test_series_of_curves_stops_once_the_feedback_is_off(bench: Any, off_at: str) -> None:

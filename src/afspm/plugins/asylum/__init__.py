@@ -34,7 +34,7 @@ from afspm.driver import (
     frame,
     refuse_value,
 )
-from afspm.model import ControlResponse, Region, ScopeState, both_ways, names
+from afspm.model import SENSITIVITY, SPRING_CONSTANT, ControlResponse, Region, ScopeState, both_ways, names
 from afspm.plugins.asylum.activity import FORCE, AsylumActivity
 from afspm.plugins.asylum.link import Link
 from afspm.plugins.asylum.result_files import AsylumFiles
@@ -74,13 +74,14 @@ _VARIABLES: Final = VariableRoles.declared(
     {
         "height": ["ZSnsr", "Raw"],
         "current": ["Cur"],
-        "deflection": ["Defl"],
+        "deflection": ["Defl", "DeflV"],
         "amplitude": ["Amp"],
         "phase": ["Phas", "Phase"],
         "frequency shift": ["Freq"],
         "time": ["Time"],
     },
     towards=["ZSnsr", "Raw"],
+    states=[SPRING_CONSTANT, SENSITIVITY],
 )
 """Both ways are in the same columns, the approach first. Igor's files have the deflection, and no force."""
 

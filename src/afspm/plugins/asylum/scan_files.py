@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from afspm.basics import NS_PER_S, FileError, PlainMapping
 from afspm.driver import FileContent, clock_ns, igor
-from afspm.model import Region, Scan, Spectrum
+from afspm.model import SENSITIVITY, SPRING_CONSTANT, Region, Scan, SettingInForce, Spectrum, stated_settings
 
 Note = PlainMapping
 
@@ -89,6 +89,12 @@ def number(note: Note, key: str) -> float | None:
     return value if math.isfinite(value) else None
 
 
+def calibration(note: Note) -> tuple[SettingInForce, ...]:
+    """Return the spring constant and the sensitivity of a note, as far as it has them; one of 0 is not calibrated."""
+    spring, sensitivity = (number(note, key) or None for key in ("SpringConstant", "InvOLS"))
+    return stated_settings({SPRING_CONSTANT: (spring, "N/m"), SENSITIVITY: (sensitivity, "m/V")})
+
+
 def upwards(note: Note) -> bool | None:
     """Return True if the row of smallest y was scanned first; None: unknown."""
     down = number(note, "ScanDown")
@@ -132,10 +138,16 @@ def _image(wave: igor.Wave, note: Note, path: Path, zone: tzinfo | None) -> File
     labels = [label or f"Channel {k + 1}" for k, label in enumerate(labels)]
     if len(labels) != count:
         raise FileError(f"{count} channels with {len(labels)} names")
-    end = end_ns(note, zone)
+    end, in_force = end_ns(note, zone), calibration(note)
     scans = tuple(
         Scan(
-            region, label, unit_of(label) or (wave.unit if k == 0 else ""), _float64(layers[:, :, k].T), end, str(path)
+            region,
+            label,
+            unit_of(label) or (wave.unit if k == 0 else ""),
+            _float64(layers[:, :, k].T),
+            end,
+            str(path),
+            in_force=in_force,
         )
         for k, label in enumerate(labels)
     )
@@ -162,6 +174,7 @@ def _curve(wave: igor.Wave, note: Note, path: Path, zone: tzinfo | None) -> File
         np.column_stack([_float64(wave.values), time_s]),
         end,
         str(path),
+        in_force=calibration(note),
     )
     start = None if end is None else end - round(points * wave.steps[0] * NS_PER_S)
     return FileContent(CONTROLLER, spectra=(spectrum,), header=note, start_ns=start, end_ns=end)

@@ -378,11 +378,13 @@ class Nanonis(Driver):
     def _fetch(self, ended: Entry) -> Sequence[Scan | Spectrum]:
         if ended["what"] == SCAN:
             found = self._images()
-            return [Scan(as_region(ended["frame"]), image.name, image.unit, image.values) for image in found]
+            scans = [Scan(as_region(ended["frame"]), image.name, image.unit, image.values) for image in found]
+            return list(map(self.channels.shown, scans))
         curve, self._activity.curve = self._activity.curve, None
         if curve is None:
             raise FileError("its data was not requested from Nanonis")
-        return [fetched.spectrum(curve, ended["what"], (ended["position"][0], ended["position"][1]))]
+        taken = fetched.spectrum(curve, ended["what"], (ended["position"][0], ended["position"][1]))
+        return [self.channels.shown(taken)]
 
     def lines(self, start: int) -> Sequence[ScanLines]:
         """Return new lines from Nanonis' memory, in which lines not yet scanned are NaN."""

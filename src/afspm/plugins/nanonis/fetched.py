@@ -160,7 +160,8 @@ def write(path: Path, content: Sequence[Scan | Spectrum], end_ns: int) -> None:
         scans = [scan for scan in content if isinstance(scan, Scan)]
         names = [scan.channel for scan in scans]
         unique = (name if name not in names[:k] else f"{name} #{k + 1}" for k, name in enumerate(names))
-        channels = {name: (scan.unit, scan.values) for name, scan in zip(unique, scans, strict=True)}
-        encoded = encode_scan(one.region, channels, facts)
+        by_name = dict(zip(unique, scans, strict=True))
+        channels = {name: (scan.unit, scan.values) for name, scan in by_name.items()}
+        encoded = encode_scan(one.region, channels, facts, {name: scan.roles for name, scan in by_name.items()})
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, [encoded])

@@ -9,14 +9,15 @@ from __future__ import annotations
 import itertools
 import math
 import re
+from collections.abc import Mapping
 from datetime import tzinfo
 from pathlib import Path
 
 import numpy as np
 
 from afspm.basics import NS_PER_S, FileError
-from afspm.driver import FileContent, local_ns, text_of
-from afspm.model import Region, Scan
+from afspm.driver import FileContent, local_ns, name_and_unit, text_of
+from afspm.model import Region, Scan, SettingInForce, stated_settings
 
 CONTROLLER = "Nanonis"
 _END = re.compile(rb"^:SCANIT_END:\s*\x1a\x04", re.MULTILINE)
@@ -52,8 +53,30 @@ def read_scan(path: Path, zone: tzinfo | None) -> FileContent:
         rows = image if upwards else image[::-1]
         # In real files, forward and backward images agree only after mirroring one of them.
         pixels = rows[:, ::-1] if way == "Backward" else rows
-        scans.append(Scan(region, f"{name} {way}", unit, pixels.astype(np.float64), end, str(path)))
+        values_of = pixels.astype(np.float64)
+        scans.append(Scan(region, f"{name} {way}", unit, values_of, end, str(path), in_force=lock_in(header)))
     return FileContent(CONTROLLER, tuple(scans), header=header, start_ns=begun, end_ns=end, upwards=upwards)
+
+
+def lock_in(header: Mapping[str, str]) -> tuple[SettingInForce, ...]:
+    """Return the modulation of the lock-in as a header states it; empty while the lock-in is off, or not stated."""
+    if header.get("Lock-in>Lock-in status", "ON") != "ON":
+        return ()
+    _, unit = name_and_unit(header.get("Lock-in>Modulated signal", ""))
+    given = {
+        "x-lock-in-amplitude": (_number(header, "Lock-in>Amplitude"), unit),
+        "x-lock-in-frequency": (_number(header, "Lock-in>Frequency (Hz)"), "Hz"),
+        "x-lock-in-phase": (_number(header, "Lock-in>Reference phase D1 (deg)"), "deg"),
+    }
+    return stated_settings(given if unit else {name: one for name, one in given.items() if one[1]})
+
+
+def _number(header: Mapping[str, str], name: str) -> float | None:
+    try:
+        value = float(header[name])
+    except (KeyError, ValueError):
+        return None
+    return value if math.isfinite(value) else None
 
 
 def _header(text: str) -> dict[str, str]:

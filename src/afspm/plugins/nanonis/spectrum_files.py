@@ -11,7 +11,7 @@ import numpy as np
 from afspm.basics import FileError
 from afspm.driver import FileContent, OtherFormat, local_ns, name_and_unit, text_of
 from afspm.model import Spectrum
-from afspm.plugins.nanonis.scan_files import CONTROLLER
+from afspm.plugins.nanonis.scan_files import CONTROLLER, lock_in
 
 _TABLE = "[DATA]"
 _LAYOUT = "%d.%m.%Y %H:%M:%S"
@@ -46,7 +46,8 @@ def read_spectrum(path: Path, zone: tzinfo | None) -> FileContent:
     names, units = zip(*map(name_and_unit, columns), strict=True)
     values = np.array([[_number(cell, row) for cell in line] for row, line in enumerate(lines, 1)])
     end = _time(header, ("Saved Date", "Date"), zone)
-    spectrum = Spectrum(_position_m(header), header["Experiment"], names, units, values, end, str(path))
+    place_m, in_force = _position_m(header), lock_in(header)
+    spectrum = Spectrum(place_m, header["Experiment"], names, units, values, end, str(path), in_force=in_force)
     start = _time(header, ("Start time",), zone)
     if start is not None and end is not None and end < start:  # the hour that the end of summer time repeats
         end = _time(header, ("Saved Date", "Date"), zone, fold=1)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from afspm.basics import FileError
 from afspm.driver import FileContent, OtherFormat, local_ns
-from afspm.model import XY, Region, Scan, Spectrum
+from afspm.model import SENSITIVITY, SPRING_CONSTANT, XY, Region, Scan, Spectrum, stated_settings
 from afspm.plugins.park.file_header import (
     CURVE_KINDS,
     CURVES,
@@ -133,8 +133,16 @@ def _curves(tags: Tags, path: Path, *, newer: bool) -> tuple[Spectrum, ...]:
     values = numbers[:, order] * np.multiply(factors, [channel["gain"] for channel in channels])[:, None]
     kind = CURVE_KINDS.get(int(header["kind"])) or ("IV" if units[0] == "V" else "force")
     names = tuple(text(channel["name"]) for channel in channels)
+    # older files have no calibration, and their header is filled with zeros
+    spring, sensitivity = float(header["spring_n_per_m"]) or None, float(header["sensitivity_v_per_um"])
+    in_force = stated_settings(
+        {
+            SPRING_CONSTANT: (spring, "N/m"),
+            SENSITIVITY: (MICROMETRE / sensitivity if sensitivity else None, "m/V"),
+        }
+    )
     return tuple(
-        Spectrum(place, kind, names, units, curve.T, filename=str(path))
+        Spectrum(place, kind, names, units, curve.T, filename=str(path), in_force=in_force)
         for place, curve in zip(_places(raw[CURVES.itemsize :], points), values, strict=True)
     )
 

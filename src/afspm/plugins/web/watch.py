@@ -124,7 +124,7 @@ class Watch:
             elif isinstance(thing, ChannelRoles):
                 self.frames.roles = thing
             elif isinstance(thing, Spectrum):
-                self.spectra.take(thing, time_ns)
+                self.spectra.take(self.frames.roles.shown(thing), time_ns)
             elif message == tip_verdict.OF_LINES and (verdict := tip_verdict.read_line_verdict(thing)) is not None:
                 self.frames.take_change(verdict.began_ns, verdict.since_row)
             elif message == "DriftMapping":

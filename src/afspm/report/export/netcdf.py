@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 
 import numpy as np
 
@@ -49,6 +50,7 @@ def scan_file(scans: ScanSet, about: Mapping[str, object], facts: Mapping[str, o
         variables[name] = Variable(("y", "x"), scan.values, attributes)
     region, first = scans.region, scans.first
     where = {"center_m": region.center_m, "size_m": region.size_m, "angle_rad": region.angle_rad}
+    where |= {"in_force": list(map(asdict, first.in_force)), "simulated": first.simulated}
     ends_ns = [scan.time_ns for scan in scans.values()]
     own = {**facts, **where, "frame": region.frame.value, "filename": first.filename, "ends_ns": ends_ns}
     return encoded(variables, _attributes(about) | {FACTS: json.dumps(own)})
@@ -56,14 +58,16 @@ def scan_file(scans: ScanSet, about: Mapping[str, object], facts: Mapping[str, o
 
 def spectrum_file(spectrum: Spectrum, about: Mapping[str, object], facts: Mapping[str, object]) -> bytes:
     """Return the file of a spectrum: every variable over (point)."""
+    roles = spectrum.roles.roles_of(spectrum.names)
     variables = {
-        name: Variable(("point",), spectrum.values[:, number], {"long_name": long_name, "units": unit})
-        for number, (name, long_name, unit) in enumerate(
-            zip(field_names(spectrum.names), spectrum.names, spectrum.units, strict=True)
+        name: Variable(("point",), spectrum.values[:, number], {"long_name": long_name, "units": unit, "role": role})
+        for number, (name, long_name, unit, role) in enumerate(
+            zip(field_names(spectrum.names), spectrum.names, spectrum.units, roles, strict=True)
         )
     }
     where = {"position_m": spectrum.position_m, "frame": spectrum.frame.value, "kind": spectrum.kind}
-    own = {**facts, **where, "filename": spectrum.filename, "measured_ns": spectrum.time_ns}
+    known = {"variables": spectrum.roles.listed(spectrum.names), "in_force": list(map(asdict, spectrum.in_force))}
+    own = {**facts, **where, **known, "filename": spectrum.filename, "measured_ns": spectrum.time_ns}
     return encoded(variables, _attributes(about) | {FACTS: json.dumps(own)})
 
 

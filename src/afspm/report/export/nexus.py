@@ -6,6 +6,7 @@ import io
 import json
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 
 import numpy as np
 
@@ -37,8 +38,11 @@ def grid_file(stack: SpectrumStack, metadata: Mapping[str, str]) -> bytes:
             values(data, "y", stack.points.y_m, "m", "y before the grid was turned")
             values(data, "x", stack.points.x_m, "m", "x before the grid was turned")
             values(data, swept, stack.swept, stack.swept_unit, stack.swept_name)
+            mark(data[swept], role=stack.role_of(stack.swept_name))
             for field, (name, curves) in zip(fields, stack.curves.items(), strict=True):
                 values(data, field, mean_over_repeats(curves)[:, :, number], stack.units[name], name)
+                columns = stack.columns[min(number, len(stack.columns) - 1)]
+                mark(data[field], role=stack.role_of(columns.get(name, "")))
         collection = group(entry, ABOUT, "NXcollection")
         put(collection, "about", json.dumps(_about_grid(stack, swept, dict(zip(stack.curves, fields, strict=True)))))
         collection["time_ns"] = stack.times[:, :, 0].astype(np.int64)
@@ -48,7 +52,13 @@ def grid_file(stack: SpectrumStack, metadata: Mapping[str, str]) -> bytes:
 def _about_grid(stack: SpectrumStack, swept: str, fields: Mapping[str, str]) -> dict[str, object]:
     # `afspm.read` rebuilds the spectra from this; `ways` lists the directions present in a column
     columns = {
-        column: {"name": column, "unit": stack.units[name], "field": fields[name], "ways": [direction]}
+        column: {
+            "name": column,
+            "unit": stack.units[name],
+            "field": fields[name],
+            "ways": [direction],
+            **stack.roles.listed([column])[0],
+        }
         for direction, one in zip(stack.directions, stack.columns, strict=False)
         for name, column in one.items()
     }
@@ -60,7 +70,13 @@ def _about_grid(stack: SpectrumStack, swept: str, fields: Mapping[str, str]) -> 
         "frame": stack.frame.value,
         "center_m": stack.points.center_m,
         "angle_rad": stack.points.angle_rad,
-        "swept": {"name": stack.swept_name, "unit": stack.swept_unit, "field": swept},
+        "swept": {
+            "name": stack.swept_name,
+            "unit": stack.swept_unit,
+            "field": swept,
+            **stack.roles.listed([stack.swept_name])[0],
+        },
+        "in_force": [asdict(one) for one in stack.in_force],
         "columns": [columns[name] for name in stack.names],
     }
 

@@ -11,7 +11,9 @@ import numpy as np
 
 from afspm.basics.plain_data import Plain
 from afspm.model import Frame, Region, Scan, Spectrum
+from afspm.model.caption import SettingInForce
 from afspm.model.channels import ROLES_APART
+from afspm.model.variables import VariableRoles
 from afspm.storage.formats import hdf5_reading, netcdf
 from afspm.storage.formats.content import FileContent, OtherFormat
 
@@ -51,6 +53,8 @@ def _scans(file: netcdf.File, facts: Plain) -> list[Scan]:
             time_ns,
             facts["filename"],
             roles=tuple(filter(None, str(variable.attributes.get("roles", "")).split(ROLES_APART))),
+            in_force=_in_force(facts),
+            simulated=bool(facts.get("simulated")),
         )
         for variable, time_ns in zip(
             (variable for name, variable in file.variables.items() if name not in _AXES), facts["ends_ns"], strict=True
@@ -63,8 +67,13 @@ def _spectrum(file: netcdf.File, facts: Plain) -> Spectrum:
     names, units = zip(*map(_name_and_unit, variables), strict=True)
     values = np.stack([variable.values for variable in variables], axis=1)
     position_m = None if place is None else (place[0], place[1])
-    frame = Frame(facts["frame"])
-    return Spectrum(position_m, facts["kind"], names, units, values, facts["measured_ns"], facts["filename"], frame)
+    frame, roles = Frame(facts["frame"]), VariableRoles.from_listed(names, facts.get("variables", ()))
+    time_ns, filename = facts["measured_ns"], facts["filename"]
+    return Spectrum(position_m, facts["kind"], names, units, values, time_ns, filename, frame, roles, _in_force(facts))
+
+
+def _in_force(facts: Plain) -> tuple[SettingInForce, ...]:
+    return tuple(SettingInForce(**one) for one in facts.get("in_force", ()))
 
 
 def _name_and_unit(variable: netcdf.Variable) -> tuple[str, str]:

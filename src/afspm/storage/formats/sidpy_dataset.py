@@ -5,12 +5,14 @@ sidpy's images are [x, y], afspm's are [y, x]. Install sidpy yourself; with its 
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from datetime import datetime
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from afspm.basics.errors import InvalidValue
+from afspm.model.caption import SettingInForce
 from afspm.model.geometry import Frame, Region
 
 if TYPE_CHECKING:
@@ -37,6 +39,9 @@ def to_sidpy(scan: Scan) -> sidpy.Dataset:
         "frame": scan.region.frame.value,
         "time": "" if scan.time is None else scan.time.isoformat(),
         "filename": scan.filename,
+        "roles": list(scan.roles),
+        "in_force": [asdict(one) for one in scan.in_force],
+        "simulated": scan.simulated,
     }
     return made
 
@@ -65,4 +70,14 @@ def from_sidpy(dataset: sidpy.Dataset) -> Scan:
             values = np.flip(values, dimension)
     time = ours.get("time")
     time_ns = round(datetime.fromisoformat(time).timestamp() * 1e9) if time else None
-    return Scan(region, str(dataset.quantity), str(dataset.units), values, time_ns, str(ours.get("filename", "")))
+    return Scan(
+        region,
+        str(dataset.quantity),
+        str(dataset.units),
+        values,
+        time_ns,
+        str(ours.get("filename", "")),
+        roles=tuple(ours.get("roles", ())),
+        in_force=tuple(SettingInForce(**one) for one in ours.get("in_force", ())),
+        simulated=bool(ours.get("simulated")),
+    )

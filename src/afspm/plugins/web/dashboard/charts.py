@@ -89,8 +89,8 @@ def spectrum_chart(
     variable = variable if variable in last.names[1:] else last.names[1]
     before = [s for _, s in spectra[:-1] if s.names == last.names and s.units == last.units][-BEFORE:]
     unit = last.units[last.names.index(variable)]
-    x = Axis.over(last.names[0], last.units[0], last.values[:, 0])
-    y = Axis.over(variable, unit, np.concatenate([s[variable] for s in (*before, last)]))
+    x = Axis.over(last.label(last.names[0]), last.units[0], last.values[:, 0])
+    y = Axis.over(last.label(variable), unit, np.concatenate([s[variable] for s in (*before, last)]))
     curves = [Curve(s.values[:, 0], s[variable], _QUIET, 0.4) for s in before]
     curves.append(Curve(last.values[:, 0], last[variable], "var(--t0)"))
     series = [_line(curve, x.scaled[0], y.scaled[0]) for curve in curves]

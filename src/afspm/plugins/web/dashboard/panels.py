@@ -58,7 +58,7 @@ class SpectraPanel:
         self._watch = watch
         self._picked_ns: int | None = None
         self._shown: tuple[object, ...] = ()
-        self._variable = ui.select([], label="variable", on_change=self.show).props("dense outlined")
+        self._variable = ui.select({}, label="variable", on_change=self.show).props("dense outlined")
         self._chart = ChartPanel()
         ui.on("spectrum_picked", self._pick)
 
@@ -69,14 +69,16 @@ class SpectraPanel:
             picked = None if self._picked_ns is None else store.at(self._picked_ns)
             spectra = store.newest(8) if picked is None or self._picked_ns is None else [(self._picked_ns, picked)]
             conditions = overview.conditions(spectra[-1][0]) if spectra else None
-        names = list(spectra[-1][1].names[1:]) if spectra else []
-        if self._variable.options != names:
-            self._variable.set_options(names, value=names[0] if names else None)
+        labels = {name: spectra[-1][1].label(name) for name in spectra[-1][1].names[1:]} if spectra else {}
+        if self._variable.options != labels:
+            self._variable.set_options(labels, value=next(iter(labels), None))
         self._variable.set_visibility(bool(spectra))
         wanted = (*(time_ns for time_ns, _ in spectra), self._variable.value)
         if wanted != self._shown:
             self._shown = wanted
             facts = [] if conditions is None else tip_facts((conditions.begin, conditions.end), conditions.acts)
+            if conditions is not None and (settings := conditions.caption()):
+                facts = [("Settings", settings), *facts]
             self._chart.show(spectrum_chart(spectra, str(self._variable.value or ""), facts))
         return bool(spectra)
 

@@ -184,6 +184,7 @@ def _data(thing: object, time_ns: int, problems: ProblemNames) -> dict[str, obje
                 "position_m": thing.position_m,
                 "names": thing.names,
                 "units": thing.units,
+                "roles": thing.roles.roles_of(thing.names),
             }
         case JournalEntries():
             return {"entries": [_entry(one, problems) for one in thing.entries]}

@@ -127,6 +127,12 @@ class ScanModel(_Answer):
     file: str = Field(description="where the controller saved it; empty if it did not")
 
 
+class VariableModel(ChannelModel):
+    """A variable of a spectrum."""
+
+    role: str = Field(description="the quantity, alike on all microscopes; may be empty", examples=["force, retrace"])
+
+
 class SpectrumModel(_Answer):
     """A spectrum, without its values."""
 
@@ -134,7 +140,7 @@ class SpectrumModel(_Answer):
     finished: TIME
     kind: str = Field(examples=["IV"])
     position_m: Pair | None
-    variables: list[ChannelModel]
+    variables: list[VariableModel]
     holder: str | None
 
 

@@ -26,6 +26,7 @@ from afspm.plugins.web.gateway.models import (
     RegionModel,
     ScanModel,
     SpectrumModel,
+    VariableModel,
 )
 
 CHUNK_BYTES = 3 << 16  # a multiple of three, so that pieces of base64 fit together
@@ -89,7 +90,8 @@ def spectrum_model(spectrum: SpectrumSummary) -> SpectrumModel:
         kind=spectrum.kind,
         position_m=None if spectrum.position_m is None else list(spectrum.position_m),
         variables=[
-            ChannelModel(name=name, unit=unit) for name, unit in zip(spectrum.names, spectrum.units, strict=True)
+            VariableModel(name=name, unit=unit, role=role)
+            for name, unit, role in zip(spectrum.names, spectrum.units, spectrum.roles, strict=True)
         ],
         holder=spectrum.holder,
     )

@@ -1,0 +1,65 @@
+"""The caption of a figure: settings as they were in force, with units."""
+
+from __future__ import annotations
+
+from afspm.model import MeasurementConditions, Parameter, SettingInForce, stated_settings
+from afspm.model.caption import caption, captioned
+
+BEGIN = (
+    Parameter("scan-speed", "5", "nm/s"),
+    Parameter("x-lock-in-amplitude", "0.01", "V"),
+    Parameter("zctrl-setpoint", "2e-11", "A"),
+    Parameter("tip-bias-voltage", "0.1", "V"),
+    Parameter("x-feedback-on", "true"),
+)
+
+
+def conditions(*end: Parameter, begin: tuple[Parameter, ...] = BEGIN) -> MeasurementConditions:
+    return MeasurementConditions(1, "", begin_in_force=begin, end_in_force=end)
+
+
+def test_caption_names_bias_setpoint_and_speed() -> None:  # spectra F10
+    assert caption(conditions(*BEGIN).in_force) == "V = 100 mV, I = 20 pA, 5 nm/s, lock-in amplitude = 10 mV"
+    assert caption(()) == ""
+
+
+def test_setpoint_is_no_part_of_a_caption_at_constant_height() -> None:
+    off = (*BEGIN[2:4], Parameter("x-feedback-on", "false"))
+    assert caption(conditions(begin=off).in_force) == "V = 100 mV, feedback off"
+
+
+def test_end_has_a_column_where_it_differs() -> None:
+    (bias, speed) = conditions(Parameter("tip-bias-voltage", "50", "mV"), begin=BEGIN[::3]).in_force
+    assert bias.columns == {"tip-bias-voltage [V]": 0.1, "tip-bias-voltage.end [V]": 0.05}
+    assert (bias.text, bias.constant) == ("100 mV → 50 mV", None)
+    assert speed.columns == {"scan-speed [m/s]": 5e-9}, "its end is not known"
+    assert speed.constant == 5e-9
+
+
+def test_begin_that_was_not_seen_has_no_value() -> None:
+    (bias,) = conditions(BEGIN[3], begin=()).in_force
+    assert bias.columns == {"tip-bias-voltage [V]": None, "tip-bias-voltage.end [V]": 0.1}
+
+
+def test_setpoint_of_another_mode_is_another_column() -> None:
+    found = conditions(Parameter("zctrl-setpoint", "0.7", "V"), begin=BEGIN[2:3]).in_force
+    assert [one.columns for one in found] == [
+        {"zctrl-setpoint [A]": 2e-11},
+        {"zctrl-setpoint [V]": None, "zctrl-setpoint.end [V]": 0.7},
+    ]
+
+
+def test_settings_of_an_earlier_version_are_those_of_the_run() -> None:
+    earlier = MeasurementConditions(1, "", begin_values=(BEGIN[3], Parameter("zctrl-igain", "5")))
+    assert earlier.in_force == (SettingInForce("tip-bias-voltage", "V", 0.1, None),)
+
+
+def test_parameters_of_a_later_version_are_captioned_by_their_names() -> None:
+    table = ["move-speed", "scan-speed", "x-spec-kind", "x-spec-from", "x-lock-in-harmonic"]
+    assert captioned(table, of_scan=True) == ["scan-speed", "x-lock-in-harmonic"]
+    assert captioned(table, of_scan=False) == ["x-spec-from", "x-lock-in-harmonic"]
+
+
+def test_calibration_that_a_file_does_not_state_is_left_out() -> None:
+    found = stated_settings({"x-spring-constant": (0.4, "N/m"), "x-sensitivity": (None, "m/V")})
+    assert found == (SettingInForce("x-spring-constant", "N/m", 0.4, 0.4),)
