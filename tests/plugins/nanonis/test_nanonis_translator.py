@@ -406,10 +406,11 @@ OF_THE_STATE = (
 
 
 @pytest.mark.parametrize(
-    ("action", "start", "most"), [(names.START_SPEC, "BiasSpectr.Start", 14), (names.START_SCAN, "Scan.Action", 28)]
+    ("action", "start", "most"), [(names.START_SPEC, "BiasSpectr.Start", 18), (names.START_SCAN, "Scan.Action", 34)]
 )
 def test_measurement_costs_few_questions(bench: Make, action: str, start: str, most: int) -> None:
-    # without polls at rest: all questions are of the requests, and of the reported end
+    # without polls at rest: all questions are of the requests, and of the reported end. Bias, setpoint and speed are
+    # read at both ends for the caption
     made = bench(speed=20.0)
     peer = made.start(poll_period_s=3600.0, trace=True)
     ready(peer)
