@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from afspm.components.line_file import LineFile, csv_line
     from afspm.components.tip_judge import Opinion, TipJudge
     from afspm.model.arrays import SD_PER_MAD, Array, robust_spread
+    from afspm.model.curve_request import CurveTable, curve_parameters
     from afspm.model.line_levelling import Levelling, flattened, levelled
     from afspm.model.planned_work import PlannedWork
     from afspm.model.snapshot import from_plain, restored, snapshot, to_plain
@@ -26,6 +27,7 @@ __all__ = [
     "SD_PER_MAD",
     "Array",
     "ChannelPairing",
+    "CurveTable",
     "HeightPair",
     "Levelling",
     "LineFile",
@@ -37,6 +39,7 @@ __all__ = [
     "TipJudge",
     "append_note",
     "csv_line",
+    "curve_parameters",
     "flattened",
     "from_plain",
     "levelled",
@@ -58,6 +61,7 @@ if not TYPE_CHECKING:
             "afspm.components.line_file": "LineFile csv_line",
             "afspm.components.tip_judge": "Opinion TipJudge",
             "afspm.model.arrays": "SD_PER_MAD Array robust_spread",
+            "afspm.model.curve_request": "CurveTable curve_parameters",
             "afspm.model.line_levelling": "Levelling flattened levelled",
             "afspm.model.planned_work": "PlannedWork",
             "afspm.model.snapshot": "from_plain restored snapshot to_plain",

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from afspm.basics.lazy import lazily
 
 if TYPE_CHECKING:
+    from afspm.model.caption import SENSITIVITY, SPRING_CONSTANT, SettingInForce, stated_settings
     from afspm.model.variables import VariableRoles
     from afspm.storage.formats import hdf5_reading
     from afspm.storage.formats.content import FileContent, OtherFormat, local_ns, name_and_unit, text_of
@@ -67,6 +68,8 @@ __all__ = [
     "LOST",
     "POSITION",
     "SCAN",
+    "SENSITIVITY",
+    "SPRING_CONSTANT",
     "TCP",
     "TRACE",
     "Activity",
@@ -88,6 +91,7 @@ __all__ = [
     "Receiver",
     "ResultFiles",
     "ScriptedDriver",
+    "SettingInForce",
     "SettingsGroup",
     "ShadowDriver",
     "Stated",
@@ -120,6 +124,7 @@ __all__ = [
     "refusal",
     "refuse_value",
     "require_question",
+    "stated_settings",
     "text_of",
 ]
 
@@ -127,6 +132,7 @@ if not TYPE_CHECKING:
     __getattr__ = lazily(
         __name__,
         {
+            "afspm.model.caption": "SENSITIVITY SPRING_CONSTANT SettingInForce stated_settings",
             "afspm.model.variables": "VariableRoles",
             "afspm.storage.formats": "hdf5_reading igor netcdf",
             "afspm.storage.formats.content": "FileContent OtherFormat local_ns name_and_unit text_of clock_ns",

@@ -22,7 +22,6 @@ from afspm.basics.lazy import lazily
 
 if TYPE_CHECKING:
     from afspm.model import parameter_names as names
-    from afspm.model.caption import SENSITIVITY, SPRING_CONSTANT, SettingInForce, stated_settings
     from afspm.model.channels import (
         HEIGHT_RETRACE,
         TOPOGRAPHY,
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
         both_ways,
         of_role,
     )
-    from afspm.model.curve_request import CurveTable, curve_parameters
     from afspm.model.events import (
         LONGEST_NOTE,
         PERSON,
@@ -106,8 +104,6 @@ __all__ = [
     "RELAY_REQUEST",
     "RESTART_REQUEST",
     "RETRACE",
-    "SENSITIVITY",
-    "SPRING_CONSTANT",
     "STOPPED_BY_AGENT",
     "TOPOGRAPHY",
     "WAIT_FOR_CONTROL",
@@ -122,7 +118,6 @@ __all__ = [
     "ControlRequest",
     "ControlResponse",
     "ControlState",
-    "CurveTable",
     "Feedback",
     "Frame",
     "Grant",
@@ -168,27 +163,22 @@ __all__ = [
     "ScanSet",
     "ScopeState",
     "ScopeStatus",
-    "SettingInForce",
     "Spectrum",
     "TipStatus",
     "both_ways",
     "component_of",
-    "curve_parameters",
     "is_of_instrument",
     "names",
     "of_role",
     "registration_summary",
     "request_name",
-    "stated_settings",
 ]
 
 if not TYPE_CHECKING:
     __getattr__ = lazily(
         __name__,
         {
-            "afspm.model.caption": "SENSITIVITY SPRING_CONSTANT SettingInForce stated_settings",
             "afspm.model.channels": "HEIGHT_RETRACE TOPOGRAPHY ChannelName ChannelRoles both_ways of_role",
-            "afspm.model.curve_request": "CurveTable curve_parameters",
             "afspm.model.events": (
                 "LONGEST_NOTE PERSON ControlEvent JournalEntries JournalEntry LogLine Note "
                 "ProcessCondition ProcessState ProcessStates Progress RelayedMessage Role component_of"

@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 
 from afspm.basics.clock import iso_utc
 from afspm.basics.plain_data import Plain, PlainMapping
-from afspm.model import Scan, SettingInForce, Spectrum, names
+from afspm.model import Scan, Spectrum, names
 from afspm.model.arrays import Array
+from afspm.model.caption import SettingInForce
 from afspm.record import nxspm
 from afspm.record.nexus_reader import ABOUT, BIAS_SPECTRUM, DEFINITION, VENDOR, about_of
 from afspm.record.nxspm import group, mark, put, values

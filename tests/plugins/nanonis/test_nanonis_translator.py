@@ -32,7 +32,6 @@ from afspm.plugins.adaptive.quantities import kelvin_parabola
 from afspm.plugins.nanonis.emulator.scans import ScanProperties
 from afspm.plugins.nanonis.emulator.signals import CHANNELS
 from afspm.plugins.nanonis.z_controller import unit_of
-from afspm.translator.parameters import FEEDBACK_ON
 from afspm.translator.trace import FILE, TracedExchange, read_trace
 
 Make = Callable[..., Bench]
@@ -388,7 +387,7 @@ def test_current_at_a_held_z_is_proportional_to_the_bias(bench: Make) -> None:
     made = bench(speed=20.0, noise={"current_a": 1e-15, "frequency_hz": 1e-3, "white_m": 0.0})
     peer = made.start()
     ready(peer)
-    assert peer.set(FEEDBACK_ON, "false").ok
+    assert peer.set(names.FEEDBACK_ON, "false").ok
     shown = {}
     for bias in ("100", "10", "0", "-100"):
         assert peer.set(names.TIP_BIAS_VOLTAGE, bias, "mV").ok

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from afspm.model import MeasurementConditions, Parameter, SettingInForce, stated_settings
-from afspm.model.caption import caption, captioned
+from afspm.model import MeasurementConditions, Parameter
+from afspm.model.caption import SettingInForce, caption, captioned, stated_settings
 
 BEGIN = (
     Parameter("scan-speed", "5", "nm/s"),

@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 
 from afspm.basics.errors import AfspmError
-from afspm.model import Parameter, curve_parameters
+from afspm.model import Parameter
+from afspm.model.curve_request import curve_parameters
 
 
 def test_request_is_in_parameters_with_units() -> None:

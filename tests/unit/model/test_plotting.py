@@ -11,7 +11,8 @@ from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 
 from afspm.basics.errors import InvalidValue
-from afspm.model import Region, Scan, stated_settings
+from afspm.model import Region, Scan
+from afspm.model.caption import stated_settings
 
 mpl.use("Agg")
 VALUES = np.arange(12.0).reshape(3, 4) * 1e-9

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from afspm.basics import ConfigError, NoSuchItem
-from afspm.model import Spectrum, stated_settings
+from afspm.model import Spectrum
+from afspm.model.caption import stated_settings
 from afspm.model.channels import ChannelRoles
 from afspm.model.variables import VariableRoles, turning_point
 from afspm.plugins.asylum import Asylum

@@ -11,8 +11,8 @@ from typing import Any, ClassVar, Final
 
 from afspm import Component
 from afspm.basics import Angle, ConfigError, Length, MeasurementFailed, counted, quantity
-from afspm.components import OutageLog, PlannedWork, write_atomic
-from afspm.model import CurveTable, Region, curve_parameters, names
+from afspm.components import CurveTable, OutageLog, PlannedWork, curve_parameters, write_atomic
+from afspm.model import Region, names
 from afspm.plugins.adaptive.mapping import (
     MOST_SPECTRA,
     MapProgress,

@@ -26,6 +26,8 @@ from afspm.driver import (
     FRAME,
     POSITION,
     SCAN,
+    SENSITIVITY,
+    SPRING_CONSTANT,
     KeptSettings,
     ScriptedDriver,
     Value,
@@ -34,7 +36,7 @@ from afspm.driver import (
     frame,
     refuse_value,
 )
-from afspm.model import SENSITIVITY, SPRING_CONSTANT, ControlResponse, Region, ScopeState, both_ways, names
+from afspm.model import ControlResponse, Region, ScopeState, both_ways, names
 from afspm.plugins.asylum.activity import FORCE, AsylumActivity
 from afspm.plugins.asylum.link import Link
 from afspm.plugins.asylum.result_files import AsylumFiles

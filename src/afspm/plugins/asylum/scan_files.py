@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.basics import NS_PER_S, FileError, PlainMapping
-from afspm.driver import FileContent, clock_ns, igor
-from afspm.model import SENSITIVITY, SPRING_CONSTANT, Region, Scan, SettingInForce, Spectrum, stated_settings
+from afspm.driver import SENSITIVITY, SPRING_CONSTANT, FileContent, SettingInForce, clock_ns, igor, stated_settings
+from afspm.model import Region, Scan, Spectrum
 
 Note = PlainMapping
 

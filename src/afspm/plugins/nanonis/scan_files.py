@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from afspm.basics import NS_PER_S, FileError
-from afspm.driver import FileContent, local_ns, name_and_unit, text_of
-from afspm.model import Region, Scan, SettingInForce, stated_settings
+from afspm.driver import FileContent, SettingInForce, local_ns, name_and_unit, stated_settings, text_of
+from afspm.model import Region, Scan
 
 CONTROLLER = "Nanonis"
 _END = re.compile(rb"^:SCANIT_END:\s*\x1a\x04", re.MULTILINE)

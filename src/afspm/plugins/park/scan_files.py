@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.basics import FileError
-from afspm.driver import FileContent, OtherFormat, local_ns
-from afspm.model import SENSITIVITY, SPRING_CONSTANT, XY, Region, Scan, Spectrum, stated_settings
+from afspm.driver import SENSITIVITY, SPRING_CONSTANT, FileContent, OtherFormat, local_ns, stated_settings
+from afspm.model import XY, Region, Scan, Spectrum
 from afspm.plugins.park.file_header import (
     CURVE_KINDS,
     CURVES,
