@@ -108,6 +108,8 @@ class Scope(ExperimentView):
         super().__init__(link, problems or ProblemNames(), between)
         self._frame = frame
         self._curve: tuple[Parameter, ...] = ()
+        self._kind_of_curves: str | None = None
+        self._sweeps = False
         self._begun: tuple[int, float] | None = None  # finished parts and time at the first `progress`
         self._control = ControlHold(link, self.problems)
         self._commands = CommandRetry(link, self._control)
@@ -169,7 +171,7 @@ class Scope(ExperimentView):
             with self.curves(curve, kind=kind, key=key, timeout_s=timeout_s):
                 return self.spectrum(at, kind=kind, key=key, timeout_s=timeout_s)
         with self._call():
-            target = SpectrumTarget.of(at, kind, self._frame, self._curve)
+            target = self._spectrum_target(at, kind)
             return self._runner.take(target, key, self._link.until(timeout_s)).spectrum
 
     @contextmanager
@@ -187,28 +189,52 @@ class Scope(ExperimentView):
                 for number, place in enumerate(places):
                     scope.spectrum(place, kind="IV", key=f"curve-{number}")
 
-        Others may get control between two spectra. So the settings are set before each, and limits judge them each
-        time. As for `sweep`, nothing is set back after the end of the experiment or a stop of the process; with a key,
+        As for `sweep`, control is kept over the block, and the settings are set before each spectrum, so that limits
+        judge them each time; nothing is set back after the end of the experiment or a stop of the process. With a key,
         a restarted component does so at the end of the same block.
 
         Args:
-            settings: as in `curve_parameters`; without any, nothing is set.
-            kind: kind of the spectra, since each may have settings of its own; None: the present kind.
+            settings: as in `curve_parameters`; without any, the block does nothing.
+            kind: kind of the spectra, since each has settings of its own; None: the present kind.
             key: name of the block.
+
+        Raises:
+            InvalidValue: a setting is not valid or does not fit the kind; a block in a sweep, or of another kind in a
+                block.
         """
-        of_curves, outside = curve_parameters(settings), self._curve
-        first = None if kind is None else Parameter(names.SPEC_KIND, kind)
-        former = self._former([one.name for one in of_curves], key and check_key(key), first=first)
-        if of_curves:
-            until_s = self._link.until(timeout_s)
-            with self._call(), self._control.hold(until_s=until_s):
+        if not settings:
+            yield
+            return
+        if self._sweeps:
+            raise InvalidValue("settings of curves begin before a sweep, not in it", where="curves")
+        of_curves, outside = curve_parameters(settings, kind), (self._curve, self._kind_of_curves)
+        until_s = self._link.until(timeout_s)
+        with self._control.hold(until_s=until_s, keeps=True):
+            with self._call():
+                kind = self._fitting(kind or self._present_kind(until_s))
+                first = None if kind is None else Parameter(names.SPEC_KIND, kind)
+                of_key = None if key is None else f"curves {check_key(key)}"
+                former = self._former([one.name for one in curve_parameters(settings, kind)], of_key, first=first)
                 former.remember(until_s)
-        self._curve = (*outside, *of_curves)
-        try:
-            with self._setting_back(former, timeout_s):
-                yield
-        finally:
-            self._curve = outside
+            self._curve, self._kind_of_curves = (*outside[0], *of_curves), kind
+            try:
+                with self._setting_back(former, timeout_s):
+                    yield
+            finally:
+                self._curve, self._kind_of_curves = outside
+
+    def _present_kind(self, until_s: float | None) -> str | None:
+        response = self._commands.read(ControlRequest.PARAM, Parameter(names.SPEC_KIND), until_s)
+        return wire.decode_parameter(response.payload).value if response.ok and response.payload else None
+
+    def _fitting(self, kind: str | None) -> str | None:
+        # the kind of a spectrum in a block of `curves`
+        if self._kind_of_curves is None or kind in (None, self._kind_of_curves):
+            return kind or self._kind_of_curves
+        raise InvalidValue(f"a spectrum {kind} in a block with settings of {self._kind_of_curves}", where="kind")
+
+    def _spectrum_target(self, at: Place | None, kind: str | None) -> SpectrumTarget:
+        return SpectrumTarget.of(at, self._fitting(kind), self._frame, self._curve)
 
     def _former(
         self,
@@ -267,17 +293,17 @@ class Scope(ExperimentView):
         if measure not in ("scan", "spectrum"):
             raise InvalidValue(f"a sweep can't measure {measure!r}", where="sweep", hint='"scan" or "spectrum"')
         plan = SweepPlan.of(parameters, order, seed)
-        target = (
-            ScanTarget.of(region, shape, self._frame)
-            if measure == "scan"
-            else SpectrumTarget.of(at, kind, self._frame, self._curve)
-        )
+        target = ScanTarget.of(region, shape, self._frame) if measure == "scan" else self._spectrum_target(at, kind)
         key = key and check_key(key)
         former = self._former([axis.name for axis in plan.axes], key, partial(values_between, plan))
         sweep = ParameterSweep(plan, target, key, former, runner=self._runner, results=self._results)
         until_s = self._link.until(timeout_s)
         with self._control.hold(until_s=until_s, keeps=True), self._setting_back(former, timeout_s):
-            yield self._each_in_a_call(sweep.points(done, until_s))
+            self._sweeps = True
+            try:
+                yield self._each_in_a_call(sweep.points(done, until_s))
+            finally:
+                self._sweeps = False
 
     def _each_in_a_call(self, points: Iterator[SweepPoint]) -> Iterator[SweepPoint]:
         while True:

@@ -77,7 +77,7 @@ class SpectroscopyGrid(Component):
             raise ConfigError(f"{repeats} is not at least 1", where="repeats")
         self.kind = kind
         self.curve = curve or {}
-        self.planned_parameters = {"curve": curve_parameters(self.curve)}
+        self.planned_parameters = {"curve": curve_parameters(self.curve, kind)}
         of_curves = (one.name for one in self.planned_parameters["curve"])
         self.needs_parameters = (
             *(names.PROBE_POS_X, names.PROBE_POS_Y, *([names.SPEC_KIND] if kind else [])),

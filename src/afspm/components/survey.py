@@ -133,7 +133,7 @@ class Survey(Component):
         half_m = min(self._closer.region.size_m) / 2
         self.curves = {name: _place(name, place, half_m) for name, place in (curves or {}).items()}
         self.curve = curve or {}
-        self.planned_parameters = {"curve": curve_parameters(self.curve)}
+        self.planned_parameters = {"curve": curve_parameters(self.curve, kind)}
         self.kind, self.channel, self.end_when_done, self.file = kind, channel, end_when_done, file
         if targets is not None:
             for name, value in {"min_height": min_height, "separation": separation}.items():

@@ -88,13 +88,14 @@ class Sweep(Component):
         self._frame = region, shape
         self._what = {"region": region, "shape": shape} if measure == "scan" else {"at": at and pair(at), "kind": kind}
         self.curve = curve or {}
-        self._of_curves = curve_parameters(self.curve)
+        self._of_curves = curve_parameters(self.curve, kind)
         self.needs_actions = (names.START_SCAN if measure == "scan" else names.START_SPEC,)
+        with_kind = bool(kind or self.curve)  # the settings of `curve` are those of one kind
         fixed = (
             *((*FRAME, names.SCAN_ANGLE) if size else ()),
             *(_PIXELS if pixels else ()),
             *(_PROBE if at else ()),
-            *((names.SPEC_KIND,) if kind else ()),
+            *((names.SPEC_KIND,) if with_kind else ()),
             *(one.name for one in self._of_curves),
         )
         for axis in self.sweep.axes:

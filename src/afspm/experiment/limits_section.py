@@ -89,6 +89,9 @@ class RoleSection(Section):
     per_hour: dict[str, WholeNumber] | None = None
 
 
+_SWEPT: Final = (
+    *(names.TIP_BIAS_VOLTAGE, *names.SPEC_ENDS, *names.SPEC_Z_ENDS, names.SPEC_Z_OFFSET, names.LOCK_IN_AMPLITUDE),
+)
 _OWN: Final = (*LimitsSection.model_fields, "actions", "roles", "forbid")
 _TYPES: Final = {
     **dict.fromkeys((names.FEEDBACK_ON, names.ENGAGED), "bool"),
@@ -169,6 +172,9 @@ class LimitsReader:
             return None
         unit = self._unit(name, fields, path)
         read = self._limit(fields, path, unit)
+        if read.unseen_sweeps and name not in _SWEPT:
+            hint = f"it is for {', '.join(_SWEPT)}"
+            self.document.error(f"[limits.{name}] unseen_sweeps: no curve sweeps it", *path, "unseen_sweeps", hint=hint)
         for key, value in (("step", read.step), ("rate", read.rate_per_s)):
             if value is not None and value <= 0:
                 self.document.error(f"[limits.{name}] {key} is not above zero", *path, key)

@@ -25,7 +25,7 @@ CurveTable = dict[str, int | float | str | list[str] | dict[str, float | str]]
 """The settings as a table of an experiment file."""
 
 
-def curve_parameters(given: CurveSettings, where: str = "curve") -> tuple[Parameter, ...]:
+def curve_parameters(given: CurveSettings, kind: str | None = None, where: str = "curve") -> tuple[Parameter, ...]:
     """Return the parameters that a request for curves sets.
 
     Args:
@@ -34,10 +34,11 @@ def curve_parameters(given: CurveSettings, where: str = "curve") -> tuple[Parame
             `points`; `point_time`, time to measure each point; `z_offset`, height at which a bias is swept, as for a
             sweep of the height; `lock_in`, a mapping with `amplitude` (peak, of the bias) and `frequency`. Other
             quantities than `sweep` may be numbers in SI.
+        kind: kind of the curves; None: not known.
         where: place of the request, for errors.
 
     Raises:
-        InvalidValue, UnitError: a key or a value is not valid.
+        InvalidValue, UnitError: a key or a value is not valid, or does not fit the kind.
     """
     _known(given, KEYS, where)
     made = []
@@ -55,6 +56,14 @@ def curve_parameters(given: CurveSettings, where: str = "curve") -> tuple[Parame
     _known(lock_in, _LOCK_IN, f"{where}.lock_in")
     for key, (name, unit) in _LOCK_IN.items():
         made += _quantity(lock_in.get(key), name, unit, f"{where}.lock_in.{key}")
+    other = {
+        **dict.fromkeys(names.SWEEPS_BIAS, ("bias", names.SPEC_Z_ENDS)),
+        **dict.fromkeys(names.SWEEPS_HEIGHT, ("height", (*names.SPEC_ENDS, names.SPEC_Z_OFFSET))),
+    }
+    swept, unfit = other.get(kind or "", ("", ()))
+    for one in made:
+        if one.name in unfit:
+            raise InvalidValue(f"a curve {kind} sweeps the {swept}, and has no {one.name}", where=where)
     return tuple(made)
 
 

@@ -59,6 +59,10 @@ class Claims:
             for name, value in read_back.items()
             if name not in _PROVED_ELSEWHERE and not table[name].measured
         }
+        kind = coming.get(names.SPEC_KIND, read_back.get(names.SPEC_KIND))
+        if kind != read_back.get(names.SPEC_KIND, kind):  # each kind of curve has settings of its own
+            for name in names.OF_CURVES:
+                coming.pop(name, None)
         coming |= own
         if self._kept["running"] is not None:  # the run itself changes its running measurement
             for name in own:

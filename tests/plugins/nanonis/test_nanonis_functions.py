@@ -58,8 +58,8 @@ def test_documented_function_is_called_by_an_action(bench: Make) -> None:
 def test_parameter_of_an_experiment_file_is_one_value_of_a_pair_of_functions(bench: Make) -> None:
     rows: dict[str, dict[str, object]] = {
         "x-tip-lift": {"vendor": "ZCtrl.TipLift", "unit": "m"},
-        "x-modulation": {"vendor": "LockIn.ModAmp 1", "unit": "V"},
-        "x-sweep-distance": {"vendor": "ZSpectr.Range #2", "unit": "m"},
+        "x-harmonic": {"vendor": "LockIn.ModHarmonic 1", "type": "int"},
+        "x-settling": {"vendor": "ZSpectr.Timing #2", "unit": "s"},
         "x-cutoff": {"vendor": "LockIn.DemodLPFilter 2 #2", "unit": "Hz"},
         "x-offset-back": {"vendor": "BiasSpectr.ZOffRevert", "type": "bool"},
         "x-slew": {"vendor": "BiasSpectr.Timing #5", "unit": "s"},
@@ -71,11 +71,11 @@ def test_parameter_of_an_experiment_file_is_one_value_of_a_pair_of_functions(ben
     registers = made.emulator.software.core.registers
     assert peer.set("x-tip-lift", "2", "nm").ok
     assert registers.get("ZCtrl.TipLift") == (pytest.approx(2e-9),)
-    assert peer.set("x-modulation", "5", "mV").ok
-    assert registers.get("LockIn.ModAmp", (1,)) == (pytest.approx(5e-3),)
-    assert registers.get("LockIn.ModAmp", (2,)) == (0.02,), "the other modulator keeps its amplitude"
-    assert peer.set("x-sweep-distance", "10", "nm").ok
-    assert registers.get("ZSpectr.Range") == (0.0, pytest.approx(1e-8))
+    assert peer.set("x-harmonic", "2").ok
+    assert registers.get("LockIn.ModHarmonic", (1,)) == (2,)
+    assert registers.get("LockIn.ModHarmonic", (2,)) == (), "the other modulator keeps its harmonic"
+    assert peer.set("x-settling", "10", "ms").ok
+    assert registers.get("ZSpectr.Timing")[:2] == pytest.approx((0.05, 0.01), rel=1e-6)
     made.at_panel(lambda emulator: emulator.software.functions.call("LockIn.DemodLPFilterSet", [2, 4, 50.0]))
     assert peer.set("x-cutoff", "100", "Hz").ok
     assert registers.get("LockIn.DemodLPFilter", (2,)) == (4, 100.0), "the order is marked as unchanged"

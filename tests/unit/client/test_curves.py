@@ -24,7 +24,7 @@ class CurveLab(Lab):
 
     def __init__(self) -> None:
         super().__init__()
-        self.values |= dict(zip((*names.SPEC_ENDS, names.SPEC_POINTS), BEFORE, strict=True))
+        self.values |= dict(zip((*names.SPEC_ENDS, names.SPEC_POINTS), BEFORE, strict=True)) | {"x-spec-kind": "IV"}
         self.measured: list[tuple[str, str, str]] = []
 
     @property
@@ -103,3 +103,38 @@ def test_wrong_request_sends_nothing() -> None:
     with pytest.raises(InvalidValue, match="pionts"):
         scope_of(lab).spectrum(kind="IV", pionts=3)  # type: ignore[call-arg]
     assert not lab.executed
+
+
+def test_block_and_sweep_with_one_key_are_both_set_back(tmp_path: Path) -> None:
+    lab = CurveLab()
+    scope = scope_of(lab, tmp_path)
+    with scope.curves(SETTINGS, key="a"), scope.sweep({"x-spec-to": ["0.6 V"]}, measure="spectrum", key="a") as points:
+        list(points)
+    assert lab.measured == [("-0.5", "0.6", "201")]
+    assert lab.in_force == BEFORE
+
+
+def test_spectrum_of_another_kind_in_a_block_is_refused() -> None:
+    lab = CurveLab()
+    scope = scope_of(lab)
+    with scope.curves(SETTINGS):
+        assert scope.spectrum((1e-7, 0.0)).kind == "IV", "the kind in force at its begin"
+        with pytest.raises(InvalidValue, match="settings of IV"):
+            scope.spectrum((1e-7, 0.0), kind="force")
+    assert lab.in_force == BEFORE
+
+
+def test_block_in_a_sweep_is_refused() -> None:
+    lab = CurveLab()
+    scope = scope_of(lab)
+    with scope.sweep({"x-spec-to": ["0.6 V"]}, measure="spectrum"), pytest.raises(InvalidValue, match="before a sweep"):
+        scope.spectrum((1e-7, 0.0), points=20)
+    assert not lab.measured
+
+
+def test_control_is_kept_over_a_block() -> None:
+    lab = CurveLab()
+    with (scope := scope_of(lab)).curves(SETTINGS):
+        scope.spectrum((1e-7, 0.0))
+        assert lab.control.holder == lab.name
+    assert lab.control.holder is None

@@ -57,3 +57,18 @@ def test_wrong_request_is_refused_with_its_place(asked: dict[str, Any], where: s
     with pytest.raises(AfspmError) as caught:
         curve_parameters(asked)
     assert where in str(caught.value.where)
+
+
+@pytest.mark.parametrize(
+    ("asked", "kind"),
+    [
+        ({"sweep": ("10 nm", "0 nm")}, "IV"),
+        ({"sweep": ("-1 V", "1 V")}, "force"),
+        ({"z_offset": "-50 pm"}, "z"),
+    ],
+)
+def test_request_that_does_not_fit_the_kind_is_refused(asked: dict[str, Any], kind: str) -> None:
+    assert curve_parameters(asked)
+    assert curve_parameters(asked, "GVP")
+    with pytest.raises(AfspmError, match=f"a curve {kind} sweeps the"):
+        curve_parameters(asked, kind)

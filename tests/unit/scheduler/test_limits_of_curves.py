@@ -94,3 +94,28 @@ def test_both_ends_of_a_sweep_are_judged_by_rules(last: str, kind: str, *, may: 
         names.FEEDBACK_ON: (Parameter(names.FEEDBACK_ON, "true"),),
     })  # fmt: skip
     assert (held.check_forbidden(CURVE, present) is None) is may
+
+
+def test_height_and_modulation_of_a_curve_are_judged_too() -> None:
+    low, loud = Limit(-1e-9, None, unit="m"), Limit(None, 0.05, unit="V")
+    usual = {"x_spec_z_offset": "0", "x_lock_in_amplitude": "0.01"}
+    for limits in ({"x_spec_z_offset": low, "x_lock_in_amplitude": loud}, {"x_spec_z_from": low}):
+        assert refused(guard(**limits), "IV", **usual) == ""
+        assert "-2 nm is below" in refused(guard(**limits), "IV", **usual | {"x_spec_z_offset": "-2e-9"})
+    assert "9 V is above" in refused(guard(x_lock_in_amplitude=loud), "IV", x_lock_in_amplitude="9")
+    assert guard(x_spec_z_to=low).check("survey", setting("x-spec-z-offset", "-2", "nm"), 0) is not None
+
+
+def test_values_that_are_no_longer_shown_are_unknown() -> None:
+    held = guard(tip_bias_voltage=BIAS)
+    assert refused(held, "IV", x_spec_from="-1", x_spec_to="1") == ""
+    assert "does not show how far" in refused(held, "IV")
+    assert refused(held, "force", x_spec_from="-9", x_spec_to="9") == ""
+    assert "x-spec-from" in refused(held, None, x_spec_from="-9", x_spec_to="9")
+
+
+def test_each_limit_on_an_end_must_allow_an_unseen_sweep() -> None:
+    own = Limit(-3.0, 3.0, unit="V", unseen_sweeps=True)
+    ends = {name.replace("-", "_"): own for name in names.SPEC_ENDS}
+    assert "does not show how far" in refused(guard(tip_bias_voltage=BIAS, **ends), "IV")
+    assert refused(guard(**ends), "IV") == ""

@@ -93,7 +93,7 @@ class Adaptive(Component):
         self.kind = self._evaluation.kind
         with_kind = (names.SPEC_KIND,) if self.kind else ()
         self.curve = curve or {}
-        self.planned_parameters = {"curve": curve_parameters(self.curve)}
+        self.planned_parameters = {"curve": curve_parameters(self.curve, self.kind)}
         of_curves = (one.name for one in self.planned_parameters["curve"])
         self.needs_parameters = (names.PROBE_POS_X, names.PROBE_POS_Y, *with_kind, *of_curves)
         self.positions = tuple((float(x), float(y)) for x, y in self._region.corners_m())

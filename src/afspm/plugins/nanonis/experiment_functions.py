@@ -32,6 +32,9 @@ SETS: Final[Mapping[str, Mapping[int, str]]] = {
     "BiasSpectr.MLSValsSet": {1: names.TIP_BIAS_VOLTAGE, 2: names.TIP_BIAS_VOLTAGE},
     "BiasSpectr.AltZCtrlSet": {1: names.ZCTRL_SETPOINT},
     "BiasSwp.LimitsSet": {0: names.TIP_BIAS_VOLTAGE, 1: names.TIP_BIAS_VOLTAGE},
+    "BiasSpectr.TimingSet": {1: names.SPEC_Z_OFFSET},
+    "LockIn.ModAmpSet": {1: names.LOCK_IN_AMPLITUDE},
+    "ZSpectr.RangeSet": {0: names.SPEC_Z_FROM, 1: names.SPEC_Z_TO},
     "KelvinCtrl.BiasLimitsSet": {0: names.TIP_BIAS_VOLTAGE, 1: names.TIP_BIAS_VOLTAGE},
     "MProbeBias.Set": {1: names.TIP_BIAS_VOLTAGE},
     "MProbeBias.Pulse": {2: names.PULSE_DURATION, 3: names.PULSE_VOLTAGE},
@@ -76,12 +79,13 @@ _REFUSED_ACTIONS: Final[Mapping[str, str]] = {
     r"TipShaper\.Start": f"use {names.CRASH}, whose depth limits judge",
     r"Scan\.Action 0": f"use {names.START_SCAN}, which limits judge",
     r"(Bias|Z)Spectr\.Start": f"use {names.START_SPEC}, which limits judge",
+    r"FolMe\.PSOnOffSet [^0]": f"each move of the tip would begin a curve: use {names.START_SPEC}, which limits judge",
     r"Util\.Quit": f"it ends Nanonis: {_AT_PANEL}",
 }
 """Functions that an action may not call either, by the function and its arguments."""
 
 _CHOSEN_IN_NANONIS: Final = (
-    r"(GenSwp|HSSwp|FunGen[12]Ch)\.Start|Script\.(Run|LUTDeploy)|Util\.SettingsLoad|MPass\.Activate|Pattern\.ExpStart"
+    r"(BiasSwp|GenSwp|HSSwp|FunGen[12]Ch)\.Start|Script\.(Run|LUTDeploy)|Util\.SettingsLoad|MPass\.Activate|Pattern\.ExpStart"
     r"|CPDComp\.Open|KelvinCtrl\.CtrlOnOffSet [^0]"
 )
 

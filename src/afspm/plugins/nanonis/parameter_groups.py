@@ -295,11 +295,19 @@ class DriftRate(Group):
 
 
 class SweptBias(Group):
-    """First and last bias of bias spectroscopy."""
+    """First and last bias of bias spectroscopy, unless it sweeps the segments of a table."""
 
     names = names.SPEC_ENDS
+    _linear: ClassVar = "Linear"
 
     def read(self) -> dict[str, Value]:
+        try:
+            (mode,) = self._ask("BiasSpectr.MLSModeGet")
+        except NanonisError:  # a release without segments
+            mode = self._linear
+        if mode != self._linear:
+            reason = f"bias spectroscopy sweeps the segments of its table ({mode}): set it to {self._linear}"
+            raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, reason)
         return dict(zip(self.names, self._numbers("BiasSpectr.LimitsGet"), strict=True))
 
     def write(self, values: Mapping[str, Value]) -> None:

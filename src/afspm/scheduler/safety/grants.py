@@ -42,7 +42,7 @@ from afspm.model import (
 )
 from afspm.model.geometry import XY
 from afspm.model.microscope_status import STARTS
-from afspm.model.parameter_names import BASE_PARAMETERS
+from afspm.model.parameter_names import BASE_PARAMETERS, OF_CURVES
 from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES
 from afspm.model.snapshot import to_plain
 from afspm.scheduler.control.arbitration import ArbitrationState, Rules
@@ -634,7 +634,7 @@ def _limits_of(grant: Grant) -> ExperimentLimits:
             granted.parameter: Limit(
                 granted.low,
                 granted.high,
-                unit=BASE_PARAMETERS.get(granted.parameter) or "",
+                unit=BASE_PARAMETERS.get(granted.parameter) or OF_CURVES.get(granted.parameter) or "",
                 source="the grant",
             )
             for granted in grant.ranges

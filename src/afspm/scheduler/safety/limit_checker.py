@@ -61,8 +61,11 @@ _TREATMENTS = {
     names.CRASH: (names.CRASH_DEPTH, names.CRASH_SPEED),
 }
 """The parameters that a treatment of the tip uses as they are in force."""
-_ENDS = frozenset((*names.SPEC_ENDS, *names.SPEC_Z_ENDS))
-_READ_FOR_ACTIONS = _ENDS.union(*_TREATMENTS.values())
+_OF_BIAS_CURVES = frozenset((*names.SPEC_ENDS, names.SPEC_Z_OFFSET, names.LOCK_IN_AMPLITUDE))
+_OF_HEIGHT_CURVES = frozenset((*names.SPEC_Z_ENDS, names.LOCK_IN_AMPLITUDE))
+_OF_CURVES = _OF_BIAS_CURVES | _OF_HEIGHT_CURVES
+"""The values that limits judge right before a curve, by the swept quantity."""
+_READ_FOR_ACTIONS = _OF_CURVES.union(*_TREATMENTS.values())
 
 
 class _Breach(Exception):
@@ -237,12 +240,16 @@ class LimitChecker:
         """
         numbers_read = {name: None if reported is None else self._number(reported) for name, reported in values.items()}
         usage = self.state.usage
+        for name in _OF_CURVES - values.keys() - self.limits.bounded:  # not shown any more
+            usage = usage.forget(name)
         for name, value in numbers_read.items():
             if value is None:
                 usage = usage.forget(name)
             elif name in self.limits.bounded or name in _READ_FOR_ACTIONS:
                 usage = usage.learn(name, value, now_ns, was_read=True)
-        read = self.seen(value for value in values.values() if value is not None)
+        others = {name: value for name, value in self.state.last_seen.items() if name != names.SPEC_KIND}
+        read = replace(self, state=replace(self.state, last_seen=others))
+        read = read.seen(value for value in values.values() if value is not None)
         return read._with_state(usage, self.state.position.was_read(numbers_read))
 
     def unknown(self, request: Request) -> LimitChecker:
@@ -409,6 +416,9 @@ class LimitChecker:
                 self._check_value(name, value, limit, use.now_ns)
             if name in names.SPEC_ENDS and value is not None:
                 self._check_bias(name, value)
+            if name == names.SPEC_Z_OFFSET and value is not None:
+                for one in self._limits_on(name):
+                    self._check_range(name, value, one)
 
     def _set_by(self, request: Request) -> Collection[object]:
         # an action of the experiment file sets parameters at the microscope
@@ -450,38 +460,34 @@ class LimitChecker:
             value = float(convert(volts, (own and own.unit) or "V", of_bias))
             self._check_range(name, value, replace(limit, unit=of_bias), reach)
 
-    def _limited_ends(self) -> tuple[Limit | None, list[str]]:
-        # the limit of the bias with a range, and the limited ends of sweeps
-        bias = self.limits.parameters.get(names.TIP_BIAS_VOLTAGE)
-        bias = bias if bias is not None and bias.has_range else None
-        given = self.limits.parameters
-        ends = [name for name in sorted(_ENDS) if name in given and given[name].has_range]
-        return bias, ends
+    def _limits_on(self, name: str) -> list[Limit]:
+        # of a value of a curve: its own, and those of the quantity that it is
+        same = {names.SPEC_Z_OFFSET: names.SPEC_Z_ENDS, **dict.fromkeys(names.SPEC_ENDS, (names.TIP_BIAS_VOLTAGE,))}
+        found = map(self.limits.parameters.get, (name, *same.get(name, ())))
+        return [limit for limit in found if limit is not None and limit.has_range]
 
     def _ends_to_read(self) -> list[str]:
-        bias, ends = self._limited_ends()
         in_rules = any(names.TIP_BIAS_VOLTAGE in rule.names for rule in self.limits.forbid.values())
-        needed = dict.fromkeys((*(names.SPEC_ENDS if bias or in_rules else ()), *ends))
-        return [names.SPEC_KIND, *needed] if needed else []
+        needed = {name for name in _OF_CURVES if self._limits_on(name)}.union(names.SPEC_ENDS if in_rules else ())
+        return [names.SPEC_KIND, *sorted(needed)] if needed else []
 
     def _check_curve(self) -> None:
-        bias, limited = self._limited_ends()
         kind = self._kind_of_curve() or "of no known kind"
         sweeps_bias, sweeps_height = kind not in names.SWEEPS_HEIGHT, kind not in names.SWEEPS_BIAS
-        mine = {*(names.SPEC_ENDS if sweeps_bias else ()), *(names.SPEC_Z_ENDS if sweeps_height else ())}
-        ends = mine.intersection((*(names.SPEC_ENDS if bias else ()), *limited))
-        for name in sorted(ends):
-            own, known = self.limits.parameters.get(name), self.state.usage.known.get(name)
-            # what the ends of a vector program are, its table does not show
+        mine = (_OF_BIAS_CURVES if sweeps_bias else frozenset()) | (_OF_HEIGHT_CURVES if sweeps_height else frozenset())
+        for name in sorted(mine):
+            limits, known = self._limits_on(name), self.state.usage.known.get(name)
+            own = self.limits.parameters.get(name)
+            # the table's ends are not those of a vector program
             if known is None or (sweeps_bias and sweeps_height):
-                limit = own if own is not None and own.has_range else bias
-                if limit is not None and not limit.unseen_sweeps:
-                    raise _param_error(_unseen(kind, name, limit))
+                for limit in limits if name != names.SPEC_Z_OFFSET or own in limits else ():
+                    if not limit.unseen_sweeps:
+                        raise _param_error(_unseen(kind, name, limit))
                 continue
-            if own is not None:
-                self._check_range(name, known.value, own, _TOLD_REACH)
             if name in names.SPEC_ENDS:
                 self._check_bias(name, known.value, _TOLD_REACH)
+            for limit in limits if name == names.SPEC_Z_OFFSET else [own] if own in limits and own is not None else ():
+                self._check_range(name, known.value, limit, _TOLD_REACH)
 
     def _check_value(self, name: str, value: float, limit: Limit, now_ns: int) -> None:
         text = partial(_amount_text, name, limit)
@@ -577,9 +583,8 @@ class LimitChecker:
 
 
 def _unseen(kind: str, end: str, limit: Limit) -> str:
-    what = "bias" if end in names.SPEC_ENDS else "height"
     return (
-        f"a curve {kind} may sweep the {what}, and the microscope does not show how far ({end}), so that the limit "
+        f"a curve {kind} may have any {end}: the microscope does not show how far it goes, so that the limit "
         f"can't be kept ({limit.source}); where the range set at the panel is known to be safe, allow it there: "
         "unseen_sweeps = true"
     )

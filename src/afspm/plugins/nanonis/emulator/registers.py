@@ -18,6 +18,7 @@ AT_FIRST: Final[dict[str, Values]] = {
     "BiasSpectr.AdvProps": (1, 1, 0, 0),
     "BiasSpectr.MLSMode": ("Linear",),
     "ZSpectr.Range": (0.0, 120e-9),
+    "ZSpectr.Timing": (0.05, 0.005, math.inf, 0.002, 0.001, 0.005, 0.2),
     "Bias.Calibr": (1.0, 0.0),
     "Piezo.Sens": (3.8e-9, 3.8e-9, 0.9e-9),
     "Piezo.XYZLimits": (0, -10.0, 10.0, -10.0, 10.0, -10.0, 10.0),
