@@ -399,7 +399,9 @@ class Truth:
         }
         emulator.tick = self._tick
         rig.start_scan = lambda now_s: self._started("start_scan", now_s, now_s)
-        rig.start_spectrum = lambda kind, now_s, *rest: self._started("start_spectrum", now_s, kind, now_s, *rest)
+        rig.start_spectrum = lambda kind, now_s, *rest, **curve: self._started(
+            "start_spectrum", now_s, kind, now_s, *rest, **curve
+        )
         rig.stop_spectrum = self._stopped
         self.look()
 
@@ -423,9 +425,9 @@ class Truth:
         self.look()
         return next_s
 
-    def _started(self, name: str, now_s: float, *given: Any) -> Any:
+    def _started(self, name: str, now_s: float, *given: Any, **curve: Any) -> Any:
         in_hold = self._emulator.rig.is_held(now_s)
-        activity = self._plain[name](*given)
+        activity = self._plain[name](*given, **curve)
         is_by_hand = self.person_acts or (self.person_starts and name == "start_scan")
         self.person_starts = self.person_starts and not is_by_hand
         taken = Taken(activity, is_by_hand, in_hold, self.look())

@@ -33,9 +33,12 @@ Value = float | str | bool
 
 
 def captioned(known: Iterable[str], *, of_scan: bool) -> list[str]:
-    """Return the parameters that belong to the caption of a scan, or else of a spectrum."""
-    others = (_SPECTROSCOPY,) if of_scan else (names.SCAN_SPEED,)
-    return [name for name in known if _is_captioned(name) and not name.startswith(others)]
+    """Return the parameters to read for the caption of a scan, or else of a spectrum.
+
+    Those of curves and of the lock-in are not read: the run has set them, or the maker's file states them, and at a
+    controller that answers one question at a time they would double the dead time of a curve.
+    """
+    return [name for name in known if name in _OF_ANY and (of_scan or name != names.SCAN_SPEED)]
 
 
 def _is_captioned(name: str) -> bool:

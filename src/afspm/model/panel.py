@@ -179,10 +179,8 @@ class MeasurementConditions:
 
     @property
     def in_force(self) -> tuple[SettingInForce, ...]:
-        """The settings of its caption; the settings of the run alone in records of an earlier version."""
-        if self.begin_in_force or self.end_in_force:
-            return in_force(self.begin_in_force, self.end_in_force)
-        return in_force(self.begin_values, self.end_values)
+        """The settings of its caption, also those of the run; these alone in records of an earlier version."""
+        return in_force((*self.begin_values, *self.begin_in_force), (*self.end_values, *self.end_in_force))
 
     def caption(self) -> str:
         """Return the settings in force, "V = 100 mV, I = 20 pA, 5 nm/s"; empty if none is known."""

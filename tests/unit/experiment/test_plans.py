@@ -282,7 +282,7 @@ def test_spectra_outside_the_range_of_the_microscope_are_an_error(write: Write) 
 )
 def test_a_kind_of_spectra_that_the_microscope_lacks_is_an_error(write: Write, plan: str) -> None:
     what = only_error(write(plan + 'kind = "Force"\n', frame=SIMULATED)).what
-    assert what == "[plan] plans what its microscope refuses: x-spec-kind: 'Force' is not one of IV, force"
+    assert what == "[plan] plans what its microscope refuses: x-spec-kind: 'Force' is not one of IV, force, z"
     assert not errors(write(plan + 'kind = "force"\n', frame=SIMULATED))
 
 

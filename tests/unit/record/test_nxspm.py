@@ -71,8 +71,8 @@ def test_spectrum_over_the_bias_of_a_tunnelling_microscope_follows_nxsts() -> No
     assert said(entry, "definition", "experiment_technique", "scan_mode") == ["NXsts", "STS", "constant height"]
     sweep = entry["experiment_instrument/bias_spectroscopy_environment/bias_spectroscopy/bias_sweep"]
     region = sweep["scan_region"]
-    assert said(region, "scan_start_bias", "scan_end_bias", "scan_offset_bias") == [-1.0, 2.0, -1.0]
-    assert said(region, "scan_range_bias") == [3.0]
+    assert said(region, "scan_start_bias", "scan_end_bias", "scan_range_bias") == [-1.0, 2.0, 3.0]
+    assert "scan_offset_bias" not in region, "the bias between sweeps is not known"
     assert said(sweep, "linear_sweep/scan_points_bias", "linear_sweep/step_size_bias") == [31, pytest.approx(0.1)]
     assert said(sweep, "spatial_location/x", "spatial_location/y") == [1e-6, 2e-6]
 

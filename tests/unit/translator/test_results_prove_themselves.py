@@ -82,12 +82,12 @@ def test_a_result_has_the_settings_of_its_caption_at_both_ends(bench: Any, scan:
 
 
 def test_a_setting_that_cannot_be_read_costs_its_caption_alone(make_bench: Any, scan: Any) -> None:
-    bench = make_bench({"parameters": {"x-lock-in-amplitude": {"vendor": "Lock", "unit": "V"}}})
-    bench.microscope.values["Lock"] = 0.01
+    bench = make_bench({"parameters": {"x-sensitivity": {"vendor": "Lock", "unit": "m/V"}}})
+    bench.microscope.values["Lock"] = 1e-7
     bench.look()
     assert scan_it(bench, scan, "1", during={"Lock": math.nan})[-2:] == ["Scan2d", "FREE"]
     (found,) = [one for one in bench.beside if isinstance(one, MeasurementConditions)]
-    assert "x-lock-in-amplitude" in {one.name for one in found.begin_in_force}
+    assert "x-sensitivity" in {one.name for one in found.begin_in_force}
     assert not found.end_in_force
 
 
