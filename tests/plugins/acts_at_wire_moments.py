@@ -922,11 +922,12 @@ def _curve_of(packet: Spectrum, taken: Sequence[Taken]) -> tuple[Taken, str] | N
     for one in taken:
         if one.is_scan:
             continue
-        activity = one.activity
-        tables = [activity.values.T, activity.values.T[:, ::-1]]
-        there, back = activity.both_ways()
-        tables += [[values for _, values in way.values()] for way in (there, back)]
-        tables.append([np.concatenate([values, back[name][1]]) for name, (_, values) in there.items()])
+        tables: list[Any] = []
+        for activity in (one.activity, _over_the_way_of(packet, one.activity)):
+            tables += [activity.values.T, activity.values.T[:, ::-1]]
+            there, back = activity.both_ways()
+            tables += [[values for _, values in way.values()] for way in (there, back)]
+            tables.append([np.concatenate([values, back[name][1]]) for name, (_, values) in there.items()])
         for table in tables:
             for true in list(table)[1:]:
                 for column in packet.values.T[1:]:
@@ -935,6 +936,16 @@ def _curve_of(packet: Spectrum, taken: Sequence[Taken]) -> tuple[Taken, str] | N
                         near.append((float(np.max(np.abs(column - true))) / scale, one))
     near = [each for each in near if np.isfinite(each[0]) and each[0] < _MATCHES]
     return (min(near, key=lambda each: each[0])[1], "") if near else None
+
+
+def _over_the_way_of(packet: Spectrum, activity: Any) -> Any:
+    # Asylum's curves are over the way of the piezo that is set, whatever the tip indents
+    if "Raw" not in packet.names:
+        return activity
+    z = activity.values[:, 0]
+    way_m = float(np.ptp(packet.values[:, packet.names.index("Raw")]))
+    swept = np.linspace(z[0], z[0] + way_m, len(z))
+    return replace(activity, values=np.stack([np.interp(swept, z, column) for column in activity.values.T], axis=1))
 
 
 # --- cases by number ---
