@@ -124,7 +124,7 @@ def _changes(limits: ExperimentLimits, request: Request) -> Iterator[dict[str, P
     yield changed
     if request.kind == ControlRequest.ACTION:
         for subject in limits.sets.get(str(request.subject), ()):
-            if changed[subject.name] != subject:
+            if changed.get(subject.name, subject) != subject:
                 yield {**changed, subject.name: subject}
 
 
