@@ -212,9 +212,10 @@ class Scope(ExperimentView):
         with self._control.hold(until_s=until_s, keeps=True):
             with self._call():
                 kind = self._fitting(kind or self._present_kind(until_s))
+                of_curves = curve_parameters(settings, kind)
                 first = None if kind is None else Parameter(names.SPEC_KIND, kind)
                 of_key = None if key is None else f"curves {check_key(key)}"
-                former = self._former([one.name for one in curve_parameters(settings, kind)], of_key, first=first)
+                former = self._former([one.name for one in of_curves], of_key, first=first)
                 former.remember(until_s)
             self._curve, self._kind_of_curves = (*outside[0], *of_curves), kind
             try:

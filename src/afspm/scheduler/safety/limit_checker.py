@@ -414,11 +414,9 @@ class LimitChecker:
                 self._check_use(use, name, limit, "parameter")
             if limit is not None and value is not None:
                 self._check_value(name, value, limit, use.now_ns)
-            if name in names.SPEC_ENDS and value is not None:
-                self._check_bias(name, value)
-            if name == names.SPEC_Z_OFFSET and value is not None:
+            if name in _OF_CURVES and value is not None:
                 for one in self._limits_on(name):
-                    self._check_range(name, value, one)
+                    self._check_of_curve(name, value, one)
 
     def _set_by(self, request: Request) -> Collection[object]:
         # an action of the experiment file sets parameters at the microscope
@@ -451,14 +449,12 @@ class LimitChecker:
         if limit.high is not None and value > limit.high + abs(limit.high) * reach:
             raise _param_error(f"{setting} is above the highest allowed, {text(limit.high)} ({limit.source})")
 
-    def _check_bias(self, name: str, volts: float, reach: float = _REACH) -> None:
-        # an end of a sweep of the bias, by the range of the bias itself
-        limit = self.limits.parameters.get(names.TIP_BIAS_VOLTAGE)
-        own = self.limits.parameters.get(name)
-        if limit is not None and limit.has_range:
-            of_bias = limit.unit or "V"
-            value = float(convert(volts, (own and own.unit) or "V", of_bias))
-            self._check_range(name, value, replace(limit, unit=of_bias), reach)
+    def _check_of_curve(self, name: str, value: float, limit: Limit, reach: float = _REACH) -> None:
+        # by a limit of its own, or on the quantity that it is, which may count in another unit
+        own, si = self.limits.parameters.get(name), names.OF_CURVES[name]
+        unit = limit.unit or si
+        in_unit = float(convert(value, (own and own.unit) or si, unit))
+        self._check_range(name, in_unit, replace(limit, unit=unit), reach)
 
     def _limits_on(self, name: str) -> list[Limit]:
         # of a value of a curve: its own, and those of the quantity that it is
@@ -476,18 +472,14 @@ class LimitChecker:
         sweeps_bias, sweeps_height = kind not in names.SWEEPS_HEIGHT, kind not in names.SWEEPS_BIAS
         mine = (_OF_BIAS_CURVES if sweeps_bias else frozenset()) | (_OF_HEIGHT_CURVES if sweeps_height else frozenset())
         for name in sorted(mine):
-            limits, known = self._limits_on(name), self.state.usage.known.get(name)
-            own = self.limits.parameters.get(name)
-            # the table's ends are not those of a vector program
-            if known is None or (sweeps_bias and sweeps_height):
-                for limit in limits if name != names.SPEC_Z_OFFSET or own in limits else ():
-                    if not limit.unseen_sweeps:
-                        raise _param_error(_unseen(kind, name, limit))
-                continue
-            if name in names.SPEC_ENDS:
-                self._check_bias(name, known.value, _TOLD_REACH)
-            for limit in limits if name == names.SPEC_Z_OFFSET else [own] if own in limits and own is not None else ():
-                self._check_range(name, known.value, limit, _TOLD_REACH)
+            known, own = self.state.usage.known.get(name), self.limits.parameters.get(name)
+            for limit in self._limits_on(name):
+                # the table's ends are not those of a vector program
+                if known is not None and not (sweeps_bias and sweeps_height):
+                    self._check_of_curve(name, known.value, limit, _TOLD_REACH)
+                # a microscope that shows no height of its own for a sweep of the bias has none
+                elif not limit.unseen_sweeps and (name != names.SPEC_Z_OFFSET or limit is own):
+                    raise _param_error(_unseen(kind, name, limit))
 
     def _check_value(self, name: str, value: float, limit: Limit, now_ns: int) -> None:
         text = partial(_amount_text, name, limit)
