@@ -16,6 +16,8 @@ from afspm import wire
 from afspm.basics.clock import NeverLate
 from afspm.basics.launch import Launch, Sockets
 from afspm.client.component import Component
+from afspm.client.experiment_link import ExperimentLink
+from afspm.client.scope import Scope
 from afspm.model import (
     RELAY_REQUEST,
     ControlRequest,
@@ -445,3 +447,8 @@ def run(component: Component, lab: Lab, state_dir: Path | None = None, **launch:
 
 def state_of(lab: Lab) -> ControlState:
     return lab.control.published()
+
+
+def scope_of(lab: Lab, folder: Path | None = None, life: int = 0, port: LabPort | None = None) -> Scope:
+    """Return the scope of a life of the lab's component."""
+    return Scope(ExperimentLink(port or LabPort(lab), lab.name, source=SOURCE, session=str(life)), state_dir=folder)

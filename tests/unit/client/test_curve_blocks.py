@@ -6,10 +6,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
-from client_lab import SOURCE, Kill9, Lab, LabPort
+from client_lab import Kill9, Lab, LabPort, scope_of
 
 from afspm.basics.errors import InvalidValue
-from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
 from afspm.model import names
 from afspm.scheduler.control.arbitration import ArbitrationEvent
@@ -34,10 +33,6 @@ class CurveLab(Lab):
     def finish_spectrum(self) -> None:
         self.measured.append(self.in_force)
         super().finish_spectrum()
-
-
-def scope_of(lab: Lab, folder: Path | None = None, life: int = 0, port: LabPort | None = None) -> Scope:
-    return Scope(ExperimentLink(port or LabPort(lab), lab.name, source=SOURCE, session=str(life)), state_dir=folder)
 
 
 def two_curves(scope: Scope) -> None:

@@ -9,14 +9,13 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
-from client_lab import REGION, SCAN_S, SOURCE, Kill9, Lab, LabPort
+from client_lab import REGION, SCAN_S, Kill9, Lab, LabPort, scope_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from afspm import wire
 from afspm.basics.errors import ControlLost, InvalidValue, NoResponse, Refused
 from afspm.client.command_retry import LOST_AFTER_S, RETRY_S
-from afspm.client.experiment_link import ExperimentLink
 from afspm.client.keyed_results import KeyedResults, MeasurementResult
 from afspm.client.scope import Scope
 from afspm.model import (
@@ -36,10 +35,6 @@ from afspm.model.variables import VariableRoles
 from afspm.scheduler.control.arbitration import ArbitrationEvent
 
 TILES = [REGION.moved_to((i * 2e-6, 0.0)) for i in range(3)]
-
-
-def scope_of(lab: Lab, folder: Path, life: int, port: LabPort | None = None) -> Scope:
-    return Scope(ExperimentLink(port or LabPort(lab), lab.name, source=SOURCE, session=str(life)), state_dir=folder)
 
 
 def kill_in(lab: Lab, seconds: float, port: LabPort) -> None:

@@ -8,11 +8,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
-from client_lab import SCAN_S, SOURCE, Kill9, Lab, LabPort
+from client_lab import SCAN_S, Kill9, Lab, LabPort, scope_of
 
 from afspm import wire
 from afspm.basics.errors import InvalidValue, Refused
-from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
 from afspm.model import (
     ControlRequest,
@@ -52,10 +51,6 @@ class SweepLab(Lab):
     def finish_spectrum(self) -> None:
         self.measured.append(self.in_force)
         super().finish_spectrum()
-
-
-def scope_of(lab: Lab, folder: Path | None = None, life: int = 0, port: LabPort | None = None) -> Scope:
-    return Scope(ExperimentLink(port or LabPort(lab), lab.name, source=SOURCE, session=str(life)), state_dir=folder)
 
 
 def sweep(scope: Scope, key: str | None = "gains", swept: dict[str, SweptValues] = SWEPT) -> list[Any]:
