@@ -139,10 +139,10 @@ class CommandRetry:
         response = self.ask(ControlRequest.PARAM, wanted, until_s=until_s)
         return wire.decode_parameter(response.payload) if response.payload else wanted
 
-    def publish_settings(self, settings: tuple[Parameter, ...], key: str) -> None:
+    def publish_settings(self, settings: tuple[Parameter, ...], key: str, point: int | None = None) -> None:
         """Ask the scheduler to publish the parameters that a sweep has set for the measurement `key`."""
         link = self._link
-        message = MeasurementSettings(link.clock.now_ns(), link.name, settings, key)
+        message = MeasurementSettings(link.clock.now_ns(), link.name, settings, key, point)
         response = link.request(RELAY_REQUEST, RelayedMessage(*wire.encode(message)))
         if not response.ok:  # a scheduler of another make may not know the message
             link.log.warning("the record lacks the swept parameters of this measurement: %s", response.reason)

@@ -38,11 +38,18 @@ class InstrumentTargets:
         """
         self.first_reading(wanted.name, until_s)
         target, before = float(wanted.value or "nan"), self._read(target_of(wanted.name), wanted.unit, until_s)[0]
-        if before is None or not math.isclose(float(before), target, rel_tol=_ROUNDED):
+        if before is None or not _is_same(float(before), target):
             response = self._commands.ask(ControlRequest.PARAM, wanted, until_s=until_s)
             target = float(value_in(response, wanted, wanted.unit))
         self.arrival(wanted, target, until_s, in_control=True)
         return Parameter(target_of(wanted.name), repr(target), wanted.unit)
+
+    def is_reached(self, wanted: Parameter, until_s: float | None) -> bool:
+        """Return whether a target is in force and the instrument says that it has arrived."""
+        self.first_reading(wanted.name, until_s)
+        before = self._read(target_of(wanted.name), wanted.unit, until_s)[0]
+        is_in_force = before is not None and _is_same(float(before), float(wanted.value or "nan"))
+        return is_in_force and self._read(f"{wanted.name}.busy", None, until_s)[0] is False
 
     def in_force(self, name: str, until_s: float | None) -> Parameter:
         """Return the target in force; wait up to a minute for the first reading. Raises Refused without a target."""
@@ -78,7 +85,7 @@ class InstrumentTargets:
             value, why = self._read(name if found["busy"] else newest_of(name), asked.unit, until_s)
             if in_control and not self._control.held:
                 return math.nan if value is None else value
-            if found["target"] is not None and not math.isclose(float(found["target"]), target, rel_tol=_ROUNDED):
+            if found["target"] is not None and not _is_same(float(found["target"]), target):
                 what = f"{name} does not go to {asked.value} {asked.unit or ''} any more"
                 raise NoResponse(what, where=link.name, hint=f"its target is {found['target']:g} now")
             if found["busy"] is False and found["target"] is not None and value is not None:
@@ -101,3 +108,7 @@ class InstrumentTargets:
         if not response.ok:
             raise refused(ControlRequest.PARAM, response, name)
         return value_in(response, Parameter(name), unit), ""
+
+
+def _is_same(now: float, target: float) -> bool:
+    return math.isclose(now, target, rel_tol=_ROUNDED)

@@ -131,6 +131,16 @@ class KeyedResults:
             kept[key] = [to_plain(one) for one in before]
         self._memory.save()
 
+    @property
+    def is_withdrawn(self) -> bool:
+        """Whether the component has withdrawn the tip, and is to bring it back."""
+        return bool(self._memory.get("withdrawn", False))
+
+    @is_withdrawn.setter
+    def is_withdrawn(self, withdrawn: bool) -> None:
+        self._memory["withdrawn"] = withdrawn
+        self._memory.save()
+
     def find(self, key: str, plan: Plain) -> MeasurementResult | None:
         """Return the saved result of a key, from an earlier call or before a restart; None without a readable result.
 

@@ -6,6 +6,7 @@ from afspm.client.command_retry import CommandRetry
 from afspm.client.experiment_link import PublishedState
 from afspm.client.instrument_targets import InstrumentTargets
 from afspm.client.targets import FITS, SAME, XY, ScanTarget, Target, is_set
+from afspm.client.withdrawal import Withdrawal
 from afspm.model import (
     ControlRequest,
     Feedback,
@@ -29,18 +30,26 @@ class MeasurementSetup:
         view: the published settings in force.
     """
 
-    def __init__(self, view: PublishedState, commands: CommandRetry, targets: InstrumentTargets) -> None:
+    def __init__(
+        self, view: PublishedState, commands: CommandRetry, targets: InstrumentTargets, withdrawal: Withdrawal
+    ) -> None:
         self._view = view
         self._commands = commands
         self._targets = targets
+        self._withdrawal = withdrawal
         self._rounded: tuple[ScanParameters, ScanParameters | None] | None = None
 
     def reach(self, target: Target, until_s: float | None) -> tuple[Parameter, ...]:
         """Set the parameters of other instruments, wait until they have arrived, and return their targets in force.
 
-        Raises as `InstrumentTargets.reach`; returns early if control is lost.
+        Raises as `InstrumentTargets.reach` and `Withdrawal.bring_back`; returns early if control is lost.
         """
-        return tuple(self._targets.reach(one, until_s) for one in target.settings if is_of_instrument(one.name))
+        others = [one for one in target.settings if is_of_instrument(one.name)]
+        if target.withdraws and not all(self._targets.is_reached(one, until_s) for one in others):
+            self._withdrawal.withdraw(until_s)
+        reached = tuple(self._targets.reach(one, until_s) for one in others)
+        self._withdrawal.bring_back(until_s)
+        return reached
 
     def prepare(self, target: Target, key: str, until_s: float | None, reached: tuple[Parameter, ...] = ()) -> None:
         """Set all settings of a target, and publish its sweep parameters with the values in force.
@@ -58,7 +67,7 @@ class MeasurementSetup:
         if target.settings:
             of_microscope = (one for one in target.settings if not is_of_instrument(one.name))
             in_force = tuple(self._commands.set_parameter(one, until_s) for one in of_microscope)
-            self._commands.publish_settings((*reached, *in_force), key)
+            self._commands.publish_settings((*reached, *in_force), key, target.point)
 
     def move_probe(self, xy_m: XY, until_s: float | None) -> None:
         """Move the probe to (x, y) in m, unless it is there already."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Literal, TypedDict, Unpack
+from typing import TypedDict, Unpack, get_args
 
 from afspm import wire
 from afspm.basics import RequestError
@@ -24,8 +25,9 @@ from afspm.client.keyed_results import KeyedResults, check_key
 from afspm.client.measurement import MeasurementRunner
 from afspm.client.measurement_setup import MeasurementSetup
 from afspm.client.parameter_text import Value, to_parameter, value_in
-from afspm.client.sweeping import ParameterSweep, SweepPoint, values_between
-from afspm.client.targets import ScanTarget, SpectrumTarget, xy_of
+from afspm.client.sweeping import Measure, ParameterSweep, SweepPoint, values_between
+from afspm.client.targets import ScanTarget, SpectrumTarget, Target, xy_of
+from afspm.client.withdrawal import Withdrawal
 from afspm.model import (
     CLOCK_REQUEST,
     GRANT_REQUEST,
@@ -51,7 +53,7 @@ from afspm.model import (
 )
 from afspm.model.curve_request import CurveSettings, curve_parameters
 from afspm.model.events import HasTime
-from afspm.model.instruments import InstrumentOrders, newest_of
+from afspm.model.instruments import InstrumentOrders, is_of_instrument, newest_of
 from afspm.model.sessions import KEYED
 from afspm.model.sweep_plan import SweepOrder, SweepPlan, SweptValues
 from afspm.transport.process.parent import StopRequested
@@ -114,8 +116,9 @@ class Scope(ExperimentView):
         self._control = ControlHold(link, self.problems)
         self._commands = CommandRetry(link, self._control)
         self._targets = InstrumentTargets(link, self._control, self._commands)
-        self._setup = MeasurementSetup(link.view, self._commands, self._targets)
         self._results = KeyedResults(state_dir, link.name)
+        self._withdrawal = Withdrawal(link, self._control, self._commands, self._results)
+        self._setup = MeasurementSetup(link.view, self._commands, self._targets, self._withdrawal)
         self._runner = MeasurementRunner(link, self._control, self._commands, self._setup, self._results)
 
     # --- measuring ---
@@ -234,7 +237,7 @@ class Scope(ExperimentView):
             return kind or self._kind_of_curves
         raise InvalidValue(f"a spectrum {kind} in a block with settings of {self._kind_of_curves}", where="kind")
 
-    def _spectrum_target(self, at: Place | None, kind: str | None) -> SpectrumTarget:
+    def _spectrum_target(self, at: object, kind: str | None) -> SpectrumTarget:
         return SpectrumTarget.of(at, self._fitting(kind), self._frame, self._curve)
 
     def _former(
@@ -255,18 +258,20 @@ class Scope(ExperimentView):
         self,
         parameters: Mapping[str, SweptValues],
         *,
-        measure: Literal["scan", "spectrum"] = "scan",
-        region: Region | None = None,
+        measure: Measure = "scan",
+        region: Region | Sequence[Region] | None = None,
         shape: tuple[int, int] | None = None,
-        at: Place | None = None,
+        at: Place | Sequence[Place] | None = None,
         kind: str | None = None,
         order: SweepOrder = "snake",
         seed: int = 0,
+        repeat: int = 1,
+        withdraw: bool = False,
         key: str | None = None,
         done: int = 0,
         timeout_s: float | None = None,
     ) -> Iterator[Iterator[SweepPoint]]:
-        """Take a scan or spectrum at each combination of the values of some parameters.
+        """Take scans and spectra at each combination of the values of some parameters.
 
             with scope.sweep({"zctrl-setpoint": ["50 pA", "100 pA"], "scan-speed": ["1 um/s", "2 um/s"]}) as points:
                 for point in points:
@@ -281,25 +286,43 @@ class Scope(ExperimentView):
         Args:
             parameters: values of each parameter: a list, or a range such as {"from": "0.5 um/s", "to": "4 um/s",
                 "points": 4, "spacing": "log"}. The first parameter changes least often.
-            measure: the measurement at each point.
-            region, shape: region and shape of the scans, as for `scan`.
-            at, kind: position and kind of the spectra, as for `spectrum`.
-            order: "snake": from point to point one parameter changes, to a neighbouring value; "listed": nested loops;
-                "random".
+            measure: the measurement at each point: "scan", "spectrum", or "both", first the scans.
+            region, shape: region and shape of the scans, as for `scan`; a scan of each region of a list.
+            at, kind: position and kind of the spectra, as for `spectrum`; a spectrum at each position of a list.
+            order: "snake": from point to point one parameter changes, to a neighbouring value; "listed": nested loops
+                over the values as listed, which may come again, as in a hysteresis loop; "random".
             seed: seed of the random order.
+            repeat: number of points with the same values, one after the other.
+            withdraw: whether the tip is withdrawn while another instrument goes to its target. It then stays withdrawn
+                when the instruments are set back at the end.
             key: name of the sweep, whose measurements are then taken only once in this run, under the keys "<key>-1",
                 "<key>-2" …
             done: number of points to skip at the beginning.
         """
-        if measure not in ("scan", "spectrum"):
-            raise InvalidValue(f"a sweep can't measure {measure!r}", where="sweep", hint='"scan" or "spectrum"')
-        plan = SweepPlan.of(parameters, order, seed)
-        target = ScanTarget.of(region, shape, self._frame) if measure == "scan" else self._spectrum_target(at, kind)
+        if measure not in get_args(Measure):
+            raise InvalidValue(f"a sweep can't measure {measure!r}", where="sweep", hint='"scan", "spectrum" or "both"')
+        plan = SweepPlan.of(parameters, order, seed, repeat)
+        if withdraw and not any(is_of_instrument(axis.name) for axis in plan.axes):
+            raise InvalidValue(
+                "the tip is withdrawn while another instrument goes to its target, and none is swept",
+                where="withdraw",
+                hint="leave it out",
+            )
+        targets: list[Target] = []
+        if measure != "spectrum":
+            targets += [ScanTarget.of(one, shape, self._frame) for one in _regions(region)]
+        if measure != "scan":
+            targets += [self._spectrum_target(one, kind) for one in _places(at)]
+        if not targets:
+            raise InvalidValue(
+                "a sweep measures nothing at its points", where="sweep", hint="list a region or position"
+            )
+        targets = [replace(one, withdraws=withdraw) for one in targets]
         key = key and check_key(key)
         former = self._former([axis.name for axis in plan.axes], key, partial(values_between, plan))
-        sweep = ParameterSweep(plan, target, key, former, runner=self._runner, results=self._results)
+        sweep = ParameterSweep(plan, targets, key, former, runner=self._runner, results=self._results)
         until_s = self._link.until(timeout_s)
-        with self._control.hold(until_s=until_s, keeps=True), self._setting_back(former, timeout_s):
+        with self._control.hold(until_s=until_s, keeps=True), self._setting_back(former, timeout_s, withdraw=withdraw):
             self._sweeps = True
             try:
                 yield self._each_in_a_call(sweep.points(done, until_s))
@@ -315,7 +338,7 @@ class Scope(ExperimentView):
             yield point
 
     @contextmanager
-    def _setting_back(self, former: FormerValues, timeout_s: float | None) -> Iterator[None]:
+    def _setting_back(self, former: FormerValues, timeout_s: float | None, withdraw: bool = False) -> Iterator[None]:
         try:
             yield
         except (ExperimentEnded, StopRequested):
@@ -323,14 +346,20 @@ class Scope(ExperimentView):
             raise
         except BaseException:  # also Ctrl-C, and what the block of the user raises
             with suppress(RequestError):  # logged; the first error says more
-                self._set_back(former, SET_BACK_WITHIN_S)
+                self._set_back(former, SET_BACK_WITHIN_S, withdraw)
             raise
-        self._set_back(former, timeout_s)
+        self._set_back(former, timeout_s, withdraw)
 
-    def _set_back(self, former: FormerValues, timeout_s: float | None) -> None:
+    def _set_back(self, former: FormerValues, timeout_s: float | None, withdraw: bool) -> None:
         try:
             with self._call():
-                former.set_back(self._link.until(timeout_s))
+                until_s = self._link.until(timeout_s)
+                if withdraw and former.left_behind:
+                    self._withdrawal.withdraw(until_s)
+                former.set_back(until_s)
+                if withdraw:
+                    self._withdrawal.leave_withdrawn()
+                    self._link.log.info("the tip stays withdrawn, while the instruments go back")
         except (RequestError, ExperimentEnded, StopRequested):
             self._log_left_behind(former)
             raise
@@ -695,3 +724,13 @@ class Scope(ExperimentView):
             response = self._link.request(kind, subject, request_id=request_id)
             if not response.ok:
                 raise refused(kind, response, self._link.name)
+
+
+def _regions(given: Region | Sequence[Region] | None) -> Sequence[Region | None]:
+    return [given] if given is None or isinstance(given, Region) else given
+
+
+def _places(given: Place | Sequence[Place] | None) -> Sequence[object]:
+    # (x, y), each a number or text, or a list of such pairs
+    is_list = given is not None and all(isinstance(one, Sequence) and not isinstance(one, str) for one in given)
+    return list(given) if given is not None and is_list else [given]

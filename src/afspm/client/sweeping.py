@@ -1,10 +1,10 @@
-"""A sweep of parameters: set them at each point, and take a scan or spectrum."""
+"""A sweep of parameters: set them at each point, and take one or more scans and spectra there."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from afspm.basics.errors import UnitError
 from afspm.basics.units import convert
@@ -14,6 +14,8 @@ from afspm.client.measurement import MeasurementRunner
 from afspm.client.targets import Target
 from afspm.model import MeasurementConditions, Parameter, ScanSet, Spectrum
 from afspm.model.sweep_plan import SweepAxis, SweepPlan, SweptValue
+
+Measure = Literal["scan", "spectrum", "both"]
 
 
 class ValueInForce(NamedTuple):
@@ -25,11 +27,12 @@ class ValueInForce(NamedTuple):
 
 @dataclass(frozen=True)
 class SweepPoint:
-    """A point of a sweep and the scan or spectrum taken there.
+    """A scan or spectrum of a sweep, and the values of its point.
 
     Attributes:
-        number: number of the point, from 1, in the order of measurement.
-        of: the number of points.
+        number: number of the measurement, from 1, in order: of the point, where one measurement is taken at each.
+        of: the number of measurements.
+        point: number of the point, from 1; points may have equal values.
         key: key of the measurement; empty if the sweep has no key.
         values: value of each parameter by the plan; a number is in SI, or in the microscope's own unit
             (`SweepAxis.unit`).
@@ -40,6 +43,7 @@ class SweepPoint:
 
     number: int
     of: int
+    point: int
     key: str
     values: Mapping[str, SweptValue]
     in_force: Mapping[str, ValueInForce]
@@ -60,7 +64,7 @@ class ParameterSweep:
     """A sweep in progress, which measures each point of a plan.
 
     Args:
-        target: scan or spectrum to take at each point.
+        targets: scans and spectra to take at each point.
         key: key of the sweep; its measurements have the keys "<key>-1", "<key>-2" …
         former: remembers the values before the first point.
     """
@@ -68,27 +72,32 @@ class ParameterSweep:
     def __init__(
         self,
         plan: SweepPlan,
-        target: Target,
+        targets: Sequence[Target],
         key: str | None,
         former: FormerValues,
         *,
         runner: MeasurementRunner,
         results: KeyedResults,
     ) -> None:
-        self._plan, self._target, self._key, self._former = plan, target, key, former
+        self._plan, self._targets, self._key, self._former = plan, targets, key, former
         self._runner, self._results = runner, results
 
     def points(self, done: int, until_s: float | None) -> Iterator[SweepPoint]:
-        """Measure and yield each point, except the first `done`. Raises as `MeasurementRunner.take`."""
-        for index, places in list(enumerate(self._plan.places()))[done:]:
+        """Take and yield each measurement, except the first `done`. Raises as `MeasurementRunner.take`."""
+        each = [
+            (point, places, target) for point, places in enumerate(self._plan.places(), 1) for target in self._targets
+        ]
+        for index, (point, places, planned) in list(enumerate(each))[done:]:
             key = None if self._key is None else f"{self._key}-{index + 1}"
-            target = replace(self._target, settings=(*self._target.settings, *self._plan.settings(places)))
+            settings = (*planned.settings, *self._plan.settings(places))
+            target = replace(planned, settings=settings, point=point)
             result = None if key is None else self._results.find(key, target.facts())
             if result is None:
                 self._former.remember(until_s)
                 result = self._runner.take(target, key, until_s)
             in_force = _shown(self._plan, result.conditions)
-            yield SweepPoint(index + 1, self._plan.total, key or "", self._plan.values(places), in_force, result)
+            values = self._plan.values(places)
+            yield SweepPoint(index + 1, len(each), point, key or "", values, in_force, result)
 
 
 def values_between(plan: SweepPlan, now: Parameter, before: Parameter) -> list[Parameter]:
@@ -98,9 +107,8 @@ def values_between(plan: SweepPlan, now: Parameter, before: Parameter) -> list[P
     if None in ends or axis.in_steps() is axis:  # texts or switches have no order
         return []
     low, high = sorted(end for end in ends if end is not None)
-    places = [place for place, value in enumerate(axis.values) if low < float(value) < high]
-    places.sort(key=lambda place: float(axis.values[place]), reverse=ends[0] == high)
-    return [axis.parameter(place) for place in places]
+    between = {value: place for place, value in enumerate(axis.values) if low < float(value) < high}
+    return [axis.parameter(between[value]) for value in sorted(between, key=float, reverse=ends[0] == high)]
 
 
 def _shown(plan: SweepPlan, conditions: MeasurementConditions | None) -> dict[str, ValueInForce]:

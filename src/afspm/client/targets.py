@@ -30,11 +30,15 @@ class ScanTarget:
     Attributes:
         shape: (rows, columns).
         settings: parameters of a sweep, set before each attempt.
+        point: number of the sweep's point; None outside of a sweep.
+        withdraws: whether the tip is withdrawn while another instrument goes to its target.
     """
 
     region: Region | None
     shape: tuple[int, int] | None
     settings: tuple[Parameter, ...] = ()
+    point: int | None = None
+    withdraws: bool = False
 
     what: ClassVar = "scan"
     action: ClassVar = names.START_SCAN
@@ -93,12 +97,16 @@ class SpectrumTarget:
 
     Attributes:
         settings: parameters of the curve or of a sweep, set before each attempt.
+        point: number of the sweep's point; None outside of a sweep.
+        withdraws: whether the tip is withdrawn while another instrument goes to its target.
     """
 
     at_m: XY | None
     kind: str | None
     frame: Frame = Frame.TIP
     settings: tuple[Parameter, ...] = ()
+    point: int | None = None
+    withdraws: bool = False
 
     what: ClassVar = "spectrum"
     action: ClassVar = names.START_SPEC
@@ -139,6 +147,7 @@ Target = ScanTarget | SpectrumTarget
 
 def _facts(target: Target) -> Plain:
     facts = to_plain(target)
+    del facts["point"], facts["withdraws"]  # the key has the number; how a target is reached changes no result
     if not target.settings:
         del facts["settings"]
     return {"what": target.what, **facts}

@@ -1,12 +1,12 @@
-"""`Sweep`: a scan or a spectrum at each combination of the values of some parameters."""
+"""`Sweep`: scans and spectra at each combination of the values of some parameters."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
-from typing import Literal
+from typing import Any
 
 from afspm.basics import Angle
 from afspm.basics.errors import ConfigError, InvalidValue, UnitError
@@ -14,9 +14,10 @@ from afspm.basics.formatting import quantity
 from afspm.basics.plain_data import Plain
 from afspm.basics.units import Length
 from afspm.client.component import Component
+from afspm.client.sweeping import Measure
 from afspm.components.pace import Pace
-from afspm.components.planned_scans import FRAME, Pixels, pair, shape_of
-from afspm.components.scan_plan import ScanPlan
+from afspm.components.planned_scans import FRAME, ListedRegion, Pixels, pair, shape_of
+from afspm.components.scan_plan import XY, ScanPlan, grid_centers
 from afspm.model import Parameter, Region, names
 from afspm.model.curve_request import CurveTable, curve_parameters
 from afspm.model.instruments import is_of_instrument
@@ -29,8 +30,29 @@ _PIXELS = (names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y)
 _PROBE = (names.PROBE_POS_X, names.PROBE_POS_Y)
 
 
+@dataclass(frozen=True)
+class ListedGrid:
+    """Positions of spectra: a grid of the experiment file, as of a `SpectroscopyGrid`.
+
+    Args:
+        counts: (columns, rows).
+        spacing: (x, y) distance from one point to the next.
+        center: (x, y) of the middle.
+        angle: counter-clockwise.
+    """
+
+    counts: tuple[int, int]
+    spacing: tuple[Length, Length]
+    center: tuple[Length, Length] = (0.0, 0.0)
+    angle: Angle = 0.0
+
+    @property
+    def positions(self) -> tuple[XY, ...]:
+        return grid_centers(pair(self.center), (self.counts[0], self.counts[1]), pair(self.spacing), self.angle)
+
+
 class Sweep(Component):
-    """A scan or a spectrum at each combination of the values of some parameters.
+    """Scans and spectra at each combination of the values of some parameters.
 
     At the end the parameters are set back to their values before the sweep, also after a kill and restart. A restart
     repeats no point. Control is kept over the whole sweep; a point that was interrupted, by the repair of a tip for
@@ -44,15 +66,21 @@ class Sweep(Component):
             "0.5 um/s", to = "4 um/s", points = 4, spacing = "log"}, or with `step` instead of `points`. The first
             parameter changes least often. A parameter of another instrument, such as "cryo.temperature", is set as its
             target; each point waits until the value has arrived.
-        measure: the measurement at each point.
+        measure: the measurement at each point: "scan", "spectrum", or "both", first the scans.
         order: "snake": from point to point one parameter changes, to a neighbouring value; "listed": nested loops over
-            the values as listed; "random": shuffled by `seed`.
+            the values as listed, which may come again, as in a hysteresis loop; "random": shuffled by `seed`.
         seed: seed of the random order.
+        repeat: number of points with the same values, one after the other.
+        withdraw: whether the tip is withdrawn while another instrument, such as a cryostat, goes to its target. At the
+            end it then stays withdrawn.
         size: (width, height) of the scans; by default the present region.
         center: (x, y) of the middle of the scans; (0, 0) if not given.
         angle: angle of the scans, counter-clockwise; 0 if not given.
         pixels: (columns, rows) of the scans; by default the present numbers.
+        regions: several regions instead of `size`, each with center, size and angle: a scan of each at each point.
         at: (x, y) of the spectra; by default where the probe stands.
+        positions: several positions instead of `at`: a spectrum at each of them at each point.
+        grid: a grid of positions instead of `at`: {counts = [8, 8], spacing = ["2 nm", "2 nm"]}, and `center`, `angle`.
         kind: kind of the spectra, where the microscope can choose, e.g. "IV" or "force".
         curve: settings of the spectra, as for a `SpectroscopyGrid`: {sweep = ["-500 mV", "500 mV"], points = 201}.
         end_when_done: whether to end the whole experiment after the last point.
@@ -61,40 +89,72 @@ class Sweep(Component):
     def __init__(
         self,
         parameters: dict[str, list[str | float | bool] | dict[str, str | float]],
-        measure: Literal["scan", "spectrum"] = "scan",
+        measure: Measure = "scan",
         order: SweepOrder = "snake",
         seed: int = 0,
+        repeat: int = 1,
+        withdraw: bool = False,
         size: tuple[Length, Length] | None = None,
         center: tuple[Length, Length] | None = None,
         angle: Angle | None = None,
         pixels: Pixels | None = None,
+        regions: list[ListedRegion] | None = None,
         at: tuple[Length, Length] | None = None,
+        positions: list[tuple[Length, Length]] | None = None,
+        grid: ListedGrid | None = None,
         kind: str | None = None,
         curve: CurveTable | None = None,
         end_when_done: bool = False,
     ) -> None:
-        self.sweep, self.measure, self.end_when_done = _plan(parameters, order, seed), measure, end_when_done
+        self.sweep, self.measure, self.end_when_done = _plan(parameters, order, seed, repeat), measure, end_when_done
         self.kind = kind
-        self._given: Plain = {"parameters": parameters, "order": order, "seed": seed}
-        of_scans = {"size": size, "center": center, "angle": angle, "pixels": pixels}
-        for name, value in ({"at": at, "kind": kind, "curve": curve} if measure == "scan" else of_scans).items():
+        self._given: Plain = {
+            "parameters": parameters, "order": order, "seed": seed, "repeat": repeat, "withdraw": withdraw,
+        }  # fmt: skip
+        of_scans = {"size": size, "center": center, "angle": angle, "pixels": pixels, "regions": regions}
+        of_spectra = {"at": at, "positions": positions, "grid": grid, "kind": kind, "curve": curve}
+        of_others: dict[str, dict[str, Any]] = {"scan": of_spectra, "spectrum": of_scans, "both": {}}
+        for name, value in of_others[measure].items():
             if value is not None:
                 raise ConfigError(f"says nothing of a {measure}", where=name)
+        _refuse_both({"regions": regions, "size": size})
+        _refuse_both({"at": at, "positions": positions, "grid": grid})
         for name, value in {"center": center, "angle": angle}.items():
             if value is not None and size is None:
                 raise ConfigError("needs the `size` of the scans", where=name)
-        region = None if size is None else Region(pair(center or (0.0, 0.0)), pair(size), angle or 0.0)
-        shape = None if pixels is None else shape_of(pixels)
-        self._frame = region, shape
-        self._what = {"region": region, "shape": shape} if measure == "scan" else {"at": at and pair(at), "kind": kind}
+        instruments = [axis.name for axis in self.sweep.axes if is_of_instrument(axis.name)]
+        if withdraw and not instruments:
+            raise ConfigError("no parameter of another instrument is swept", where="withdraw", hint="leave it out")
+        self.regions: tuple[Region, ...] = ()
+        if size is not None:
+            self.regions = (Region(pair(center or (0.0, 0.0)), pair(size), angle or 0.0),)
+        elif regions is not None:
+            listed = (given if isinstance(given, ListedRegion) else ListedRegion(**given) for given in regions)
+            self.regions = tuple(entry.region for entry in listed)
+        self.positions: tuple[XY, ...] = ()
+        if grid is not None:
+            self.positions = (grid if isinstance(grid, ListedGrid) else ListedGrid(**grid)).positions
+        else:
+            self.positions = tuple(map(pair, [at] if at else positions or []))
+        for name, value, found in (("regions", regions, self.regions), ("positions", positions, self.positions)):
+            if value is not None and not found:
+                raise ConfigError("lists nothing", where=name)
+        self._shape = shape = None if pixels is None else shape_of(pixels)
+        self._what: Plain = {}
+        if measure != "spectrum":
+            self._what |= {"region": self.regions or None, "shape": shape}
+        if measure != "scan":
+            self._what |= {"at": self.positions or None, "kind": kind}
         self.curve = curve or {}
         self._of_curves = curve_parameters(self.curve, kind)
-        self.needs_actions = (names.START_SCAN if measure == "scan" else names.START_SPEC,)
+        starts = {"scan": (names.START_SCAN,), "spectrum": (names.START_SPEC,)}
+        of_tip = (names.RETRACT, names.ENGAGE) if withdraw else ()
+        self.needs_actions = (*starts.get(measure, (names.START_SCAN, names.START_SPEC)), *of_tip)
         with_kind = bool(kind or self.curve)  # the settings of `curve` are those of one kind
         fixed = (
-            *((*FRAME, names.SCAN_ANGLE) if size else ()),
+            *((*FRAME, names.SCAN_ANGLE) if self.regions else ()),
             *(_PIXELS if pixels else ()),
-            *(_PROBE if at else ()),
+            *(_PROBE if self.positions else ()),
             *((names.SPEC_KIND,) if with_kind else ()),
             *(one.name for one in self._of_curves),
         )
@@ -103,9 +163,8 @@ class Sweep(Component):
                 raise ConfigError("is swept, and fixed by another setting", where=f"parameters.{axis.name}")
         swept = tuple(axis.name for axis in self.sweep.axes)
         self.needs_parameters = (*swept, *(name for name in fixed if name != names.SCAN_ANGLE))
-        if region is not None:
-            self.plan = ScanPlan((region,), shape)  # the part that `afspm check` can look at
-        self.positions = (pair(at),) if at else ()
+        if self.regions:
+            self.plan = ScanPlan(self.regions, shape)  # the part that `afspm check` can look at
 
     @property
     def planned_parameters(self) -> dict[str, tuple[Parameter, ...]]:
@@ -117,33 +176,42 @@ class Sweep(Component):
 
     def planned_work(self, speed_m_s: float | None) -> PlannedWork:
         total, ends = self.sweep.total, self.end_when_done
-        if self.measure != "scan":
-            why = "the controller sets the duration of a spectrum"
-            return PlannedWork(spectra=total, ends_experiment=ends, why=why)
-        region, shape = self._frame
-        if region is None or shape is None:
+        spectra = 0 if self.measure == "scan" else total * max(len(self.positions), 1)
+        why = "the controller sets the duration of a spectrum"
+        if self.measure == "spectrum":
+            return PlannedWork(spectra=spectra, ends_experiment=ends, why=why)
+        if not self.regions or self._shape is None:
+            scans = total * max(len(self.regions), 1)
             why = "the file sets no size and pixels"
-            return PlannedWork(total, path_m=None, pixels=None, ends_experiment=ends, why=why)
+            return PlannedWork(scans, spectra=spectra, path_m=None, pixels=None, ends_experiment=ends, why=why)
         speeds = next((axis.values for axis in self.sweep.axes if axis.name == names.SCAN_SPEED), (speed_m_s,))
         each = total // len(speeds)
-        work = reduce(add, (planned_rounds((region,), shape, each, 0.0, speed) for speed in map(_number, speeds)))
+        rounds = (planned_rounds(self.regions, self._shape, each, 0.0, speed) for speed in map(_number, speeds))
+        work = reduce(add, rounds)
+        if spectra:
+            work = replace(work, spectra=spectra, duration_s=None, why=why)
         if arrivals := [axis.name for axis in self.sweep.axes if is_of_instrument(axis.name)]:
             work = replace(work, duration_s=None, why=f"the time in which {arrivals[0]} arrives is unknown")
         return replace(work, ends_experiment=ends)
 
     def run(self) -> None:
         sweep = to_plain(self.sweep) | {"measure": self.measure}
+        if self.sweep.repeat == 1:
+            del sweep["repeat"]  # not in what runs of earlier versions have saved
         if self.memory.setdefault("sweep", sweep) != sweep:
             raise ConfigError(
                 "the sweep was begun with other values, which are in the record of this run",
                 where="parameters",
                 hint="undo the change, or begin a new run",
             )
-        total, done = self.sweep.total, int(self.memory.get("done", 0))
+        scans = max(len(self.regions), 1) if self.measure != "spectrum" else 0
+        each = scans + (max(len(self.positions), 1) if self.measure != "scan" else 0)
+        total, done = self.sweep.total * each, int(self.memory.get("done", 0))
+        what = "point" if each == 1 else "measurement"
         pace = Pace(self.scope, self.memory)
         self.memory.save()
         if 0 < done < total:
-            self.log.info("going on with point %d of %d", done + 1, total)
+            self.log.info("going on with %s %d of %d", what, done + 1, total)
         with (
             self.scope.curves(self.curve, kind=self.kind, key="curve"),
             self.scope.sweep(**self._given, **self._what, measure=self.measure, key=KEY, done=done) as points,
@@ -154,8 +222,8 @@ class Sweep(Component):
                 if self.memory.save(synced=False):  # else a restart asks for it again
                     self.scope.forget(point.key)
                 self.scope.progress(point.number, total, left_s=pace.left_s(point.number, total))
-                self.log.info("point %d of %d: %s", point.number, total, self._text(point.values))
-        self.log.info("all %d points are measured", total)
+                self.log.info("%s %d of %d: %s", what, point.number, total, self._text(point.values))
+        self.log.info("all %d points are measured", self.sweep.total)
         if self.end_when_done:
             self.scope.end_experiment()
 
@@ -175,13 +243,18 @@ def value_text(value: SweptValue, unit: str) -> str:
     return value if isinstance(value, str) else quantity(value, unit)
 
 
-def _plan(parameters: Plain, order: SweepOrder, seed: int) -> SweepPlan:
+def _refuse_both(given: Mapping[str, object]) -> None:
+    if len(named := [name for name, value in given.items() if value is not None]) > 1:
+        raise ConfigError(f"{named[0]!r} is given, too: one of them says where to measure", where=named[1])
+
+
+def _plan(parameters: Plain, order: SweepOrder, seed: int, repeat: int) -> SweepPlan:
     for name, given in parameters.items():
         try:
-            SweepPlan.of({name: given})
+            SweepPlan.of({name: given}, order)
         except (InvalidValue, UnitError) as error:
             raise ConfigError(error.what, where=f"parameters.{name}", hint=error.hint) from error
     try:
-        return SweepPlan.of(parameters, order, seed)
+        return SweepPlan.of(parameters, order, seed, repeat)
     except InvalidValue as error:
-        raise ConfigError(error.what, where="parameters", hint=error.hint) from error
+        raise ConfigError(error.what, where=error.where or "parameters", hint=error.hint) from error

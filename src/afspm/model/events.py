@@ -275,12 +275,14 @@ class MeasurementSettings:
         who: the component.
         parameters: empty if the component's next measurements are not part of a sweep.
         key: key of the measurement; empty without a key.
+        point: number of the sweep's point, from 1 in the order of measurement; None outside of a sweep.
     """
 
     time_ns: int
     who: str
     parameters: tuple[Parameter, ...] = ()
     key: str = ""
+    point: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

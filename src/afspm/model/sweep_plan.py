@@ -32,7 +32,7 @@ class SweepAxis:
     """A parameter and its values.
 
     Attributes:
-        values: all different; numbers in `unit`.
+        values: numbers in `unit`. A value may come again: up and down again, as a hysteresis needs it.
         unit: SI for quantities; None for texts, switches, and numbers in the microscope's own unit.
     """
 
@@ -45,7 +45,7 @@ class SweepAxis:
         """Read the values of a parameter from a list or a range.
 
         Raises:
-            InvalidValue, UnitError: there are no values, a value twice, or values that this parameter can't have.
+            InvalidValue, UnitError: there are no values, or values that this parameter can't have.
         """
         if isinstance(given, Mapping):
             unit, values = (
@@ -63,8 +63,6 @@ class SweepAxis:
             raise InvalidValue(
                 f"{name}: targets of an instrument are numbers", hint='with their unit: ["4.2 K", "10 K"]'
             )
-        if len(set(values)) < len(values):
-            raise InvalidValue(f"{name} has a value twice: {list(values)}", hint="list each value once")
         return cls(name, values, unit)
 
     def parameter(self, place: int) -> Parameter:
@@ -92,49 +90,65 @@ class SweepAxis:
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """All combinations of the values of some parameters, each once.
+    """All combinations of the values of some parameters.
 
     Attributes:
         axes: the first parameter changes least often.
         order: "snake": between points one parameter changes, to a neighbouring value. "listed": nested
             loops over the values as listed. "random": shuffled by `seed`.
+        repeat: number of points with the same values, one after the other.
     """
 
     axes: tuple[SweepAxis, ...]
     order: SweepOrder = "snake"
     seed: int = 0
+    repeat: int = 1
 
     def __post_init__(self) -> None:
         if not self.axes:
             raise InvalidValue("a sweep needs a parameter at least")
         if self.order not in get_args(SweepOrder):
             raise InvalidValue(f"there is no order {self.order!r}", hint=f"one of {', '.join(get_args(SweepOrder))}")
+        if self.repeat < 1:
+            raise InvalidValue(f"each point is measured {self.repeat} times", where="repeat", hint="1 or more")
+        for axis in self.axes if self.order == "snake" else ():
+            if len(set(axis.values)) < len(axis.values):
+                raise InvalidValue(
+                    f'{axis.name} has a value twice, and the order "snake" sorts the values',
+                    hint='order = "listed" keeps them as listed; `repeat` takes each point several times',
+                )
         if self.total > MOST_POINTS:
             raise InvalidValue(f"a sweep of {self.total} points", hint=f"at most {MOST_POINTS}")
 
     @classmethod
-    def of(cls, parameters: Mapping[str, SweptValues], order: SweepOrder = "snake", seed: int = 0) -> SweepPlan:
+    def of(
+        cls, parameters: Mapping[str, SweptValues], order: SweepOrder = "snake", seed: int = 0, repeat: int = 1
+    ) -> SweepPlan:
         """Read a plan from the values of each parameter.
 
         Raises:
-            InvalidValue, UnitError: see `SweepAxis.of`; no parameter, an unknown order, or too many points.
+            InvalidValue, UnitError: see `SweepAxis.of`; no parameter, an unknown order, too many points, or a value
+                twice in an order that sorts the values.
         """
         axes = tuple(SweepAxis.of(name, given) for name, given in parameters.items())
-        return cls(tuple(axis.in_steps() for axis in axes) if order == "snake" else axes, order, seed)
+        return cls(tuple(axis.in_steps() for axis in axes) if order == "snake" else axes, order, seed, repeat)
 
     @property
     def total(self) -> int:
         """Return the number of points."""
+        return self._combinations * self.repeat
+
+    @property
+    def _combinations(self) -> int:
         return math.prod(len(axis.values) for axis in self.axes)
 
     def places(self) -> list[tuple[int, ...]]:
         """Return the points in the order of measurement, each as a tuple of one value's index per axis."""
-        if self.order == "snake":
-            return [self._snake(index) for index in range(self.total)]
-        listed = [self._listed(index) for index in range(self.total)]
+        of_order = self._snake if self.order == "snake" else self._listed
+        places = [of_order(index) for index in range(self._combinations)]
         if self.order == "random":
-            random.Random(self.seed).shuffle(listed)
-        return listed
+            random.Random(self.seed).shuffle(places)
+        return [place for place in places for _ in range(self.repeat)]
 
     def settings(self, places: Sequence[int]) -> tuple[Parameter, ...]:
         """Return the parameter values of a point."""

@@ -73,6 +73,8 @@ class ScanRow:
             found at the end. No value: not known.
         settings: parameters that a sweep had set for the scan, as the microscope reported them; a column for each.
             Without each that a person changed at the microscope before its end.
+        point: number of the sweep's point, from 1 in the order of measurement; None outside of a sweep, and in runs
+            recorded before points had numbers.
         tip_score: the last verdict on the tip: 1 good, 0.5 unclear, 0 bad; None if the scan was not judged.
         instruments: values of other instruments at the end; two columns each: "cryo.temperature [K]" and its age,
             "cryo.temperature.age [s]".
@@ -99,6 +101,7 @@ class ScanRow:
     instruments: tuple[InstrumentValue, ...] = ()
     outside: tuple[str, ...] = ()
     in_force: tuple[SettingInForce, ...] = ()
+    point: int | None = None
 
     def caption(self) -> str:
         """Return the settings in force, "V = 100 mV, I = 20 pA, 5 nm/s"; empty if none is known."""
@@ -128,6 +131,7 @@ class SpectrumRow:
     instruments: tuple[InstrumentValue, ...] = ()
     outside: tuple[str, ...] = ()
     in_force: tuple[SettingInForce, ...] = ()
+    point: int | None = None
 
     def caption(self) -> str:
         """Return the settings in force, "V = 100 mV, I = 20 pA"; empty if none is known."""

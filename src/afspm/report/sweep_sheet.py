@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,21 @@ _log = logging.getLogger("afspm.report")
 Setting = tuple[SweptSetting, ...]
 
 
+class Panel(NamedTuple):
+    """The place of a scan on the sheet: its settings, and the number of earlier points with the same settings."""
+
+    settings: Setting
+    again: int = 0
+
+    @property
+    def row(self) -> Setting:
+        return self.settings[:-1]
+
+    @property
+    def column(self) -> Panel:
+        return Panel(self.settings[-1:], self.again)
+
+
 def figures(run: Run, title: str, again: bool = False) -> Iterator[tuple[str, Figure]]:
     """Yield the contact sheet of each sweep of a run, named "sweep", "sweep_2" …
 
@@ -44,13 +60,30 @@ def figures(run: Run, title: str, again: bool = False) -> Iterator[tuple[str, Fi
     for row in run.scans:
         if row.settings and row.file and not row.interrupted:
             swept.setdefault(tuple(setting.column for setting in row.settings), []).append(row)
-    for number, rows in enumerate(swept.values(), 1):
+    for number, rows in enumerate((one for found in swept.values() for one in _panels(found)), 1):
         if len(rows) > MOST:
             _log.warning("a sweep of %d scans has no contact sheet: at most %d fit", len(rows), MOST)
             continue
-        scans = [(row.settings, scan) for row in rows if (scan := _scan(run, row)) is not None]
+        scans = [(panel, scan) for panel, row in rows.items() if (scan := _scan(run, row)) is not None]
         if scans:
             yield f"sweep_{number}" if number > 1 else "sweep", sheet(scans, title)
+
+
+def _panels(rows: Sequence[ScanRow]) -> list[dict[Panel, ScanRow]]:
+    # a dictionary for each scan of a point; of a point that was measured again, the later scan
+    sheets: list[dict[Panel, ScanRow]] = []
+    in_point: Counter[int | None] = Counter()
+    points: dict[Setting, list[int]] = {}
+    for row in {row.key or row.number: row for row in rows}.values():
+        place, again = 0, 0
+        if row.point is not None:
+            place, of_values = in_point[row.point], points.setdefault(row.settings, [])
+            in_point[row.point] += 1
+            of_values += [row.point] if row.point not in of_values else []
+            again = of_values.index(row.point)
+        sheets += [{}] if place == len(sheets) else []
+        sheets[place][Panel(row.settings, again)] = row
+    return sheets
 
 
 def _scan(run: Run, row: ScanRow) -> Scan | None:
@@ -62,12 +95,12 @@ def _scan(run: Run, row: ScanRow) -> Scan | None:
     return scans[topography(scans)]
 
 
-def sheet(scans: Sequence[tuple[Setting, Scan]], title: str) -> Figure:
-    """Return a figure of scans in rows and columns by their settings.
+def sheet(scans: Sequence[tuple[Panel, Scan]], title: str) -> Figure:
+    """Return a figure of scans, in the order of measurement, in rows and columns by their settings.
 
-    The last parameter changes along a row, all others from row to row. All scans share one range of colours, unless
-    that would leave a row without contrast: then each row has a range and a colour bar of its own. Of two scans with
-    the same settings the later one is drawn.
+    The last parameter changes along a row, all others from row to row. Where points have equal values, as in a loop,
+    each has a column, in the order of measurement if that is the same in all rows. All scans share one range of
+    colours, unless that would leave a row without contrast: then each row has a range and a colour bar of its own.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable
@@ -77,8 +110,9 @@ def sheet(scans: Sequence[tuple[Setting, Scan]], title: str) -> Figure:
     from afspm.drawing import gold
     from afspm.drawing.plotting import draw_scale_bar
 
-    across, down = _sorted(settings[-1:] for settings, _ in scans), _sorted(settings[:-1] for settings, _ in scans)
-    last, others = scans[0][0][-1], scans[0][0][:-1]
+    panels = [panel for panel, _ in scans]
+    across, down = _columns(panels), _sorted(panel.row for panel in panels)
+    last, others = panels[0].settings[-1], panels[0].row
     left_in = 0.2 + _CHARACTER_IN * max([0, *map(len, "\n".join((*map(_label, down), _names(others))).split("\n"))])
     pitch_in = _PANEL_IN + _GAP_IN
     width_in = left_in + max(len(across) * pitch_in, 2.4) + _RIGHT_IN
@@ -92,21 +126,21 @@ def sheet(scans: Sequence[tuple[Setting, Scan]], title: str) -> Figure:
     text(0.1, 0.2, title, va="center", weight="bold")
     text(left_in, 0.46, last.name, va="center", style="italic")
     text(left_in - 0.1, 0.46, _names(others), va="center", ha="right", style="italic")
-    for column, settings in enumerate(across):
-        text(left_in + column * pitch_in + _PANEL_IN / 2, 0.72, _label(settings), va="center", ha="center")
+    for number, column in enumerate(across):
+        text(left_in + number * pitch_in + _PANEL_IN / 2, 0.72, _label(column.settings), va="center", ha="center")
     for row, settings in enumerate(down):
         y_in = _TOP_IN + row * pitch_in + _PANEL_IN / 2
         text(left_in - 0.1, y_in, _label(settings), va="center", ha="right")
-    pictures = {settings: (scan, _picture(scan)) for settings, scan in scans}
-    spans = _spans({settings: picture for settings, (_, picture) in pictures.items()})
-    for settings, (scan, picture) in pictures.items():
-        place = (across.index(settings[-1:]), down.index(settings[:-1]))
+    pictures = {panel: (scan, _picture(scan)) for panel, scan in scans}
+    spans = _spans({panel: picture for panel, (_, picture) in pictures.items()})
+    for panel, (scan, picture) in pictures.items():
+        place = (across.index(panel.column), down.index(panel.row))
         x_in, y_in = left_in + place[0] * pitch_in, _TOP_IN + place[1] * pitch_in
         axes = figure.add_axes(
             (x_in / width_in, 1 - (y_in + _PANEL_IN) / height_in, _PANEL_IN / width_in, _PANEL_IN / height_in)
         )
         axes.set_facecolor("0.6")  # not measured
-        span = spans[settings[:-1]]
+        span = spans[panel.row]
         width_m, height_m = scan.region.size_m
         axes.imshow(
             np.ma.masked_invalid(picture), cmap=gold(), vmin=span.low, vmax=span.high, origin="lower",
@@ -136,11 +170,11 @@ def sheet(scans: Sequence[tuple[Setting, Scan]], title: str) -> Figure:
     return figure
 
 
-def _spans(pictures: Mapping[Setting, Array]) -> dict[Setting, ValueRange]:
+def _spans(pictures: Mapping[Panel, Array]) -> dict[Setting, ValueRange]:
     # the range of colours of each row; a picture of one value, or of none, has no range
     rows: dict[Setting, list[Array]] = {}
-    for settings, picture in pictures.items():
-        rows.setdefault(settings[:-1], []).append(picture)
+    for panel, picture in pictures.items():
+        rows.setdefault(panel.row, []).append(picture)
     varied = {row: [one for one in found if np.nanmax(one, initial=-np.inf) > np.nanmin(one, initial=np.inf)]
               for row, found in rows.items()}  # fmt: skip
     spans = {row: shared_range(found) for row, found in varied.items() if found}
@@ -151,6 +185,18 @@ def _spans(pictures: Mapping[Setting, Array]) -> dict[Setting, ValueRange]:
 
 def _picture(scan: Scan) -> Array:
     return reduced(flattened(scan.values), _LARGEST_PX)
+
+
+def _columns(panels: Sequence[Panel]) -> list[Panel]:
+    rows: dict[Setting, list[Panel]] = {}
+    for panel in panels:
+        rows.setdefault(panel.row, []).append(panel.column)
+    orders = list(rows.values())
+    if any(panel.again for panel in panels) and all(order == orders[0] for order in orders):
+        return orders[0]
+    found = {panel.column for panel in panels}
+    values = _sorted(panel.column.settings for panel in panels)
+    return sorted(found, key=lambda column: (values.index(column.settings), column.again))
 
 
 def _sorted(settings: Iterable[Setting]) -> list[Setting]:

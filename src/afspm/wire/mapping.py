@@ -239,7 +239,7 @@ _NOTE = MessageMapping(
 _SETTINGS = MessageMapping(
     MeasurementSettings,
     journal_pb2.MeasurementSettings,
-    *("who",),
+    *("who", "point"),
     time_ns=_time(),
     parameters=_each("parameters", PARAMETER),
     key=FieldMapping("key", sparse=True),

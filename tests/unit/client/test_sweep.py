@@ -19,8 +19,12 @@ from afspm.model import (
     MeasurementConditions,
     Parameter,
     Problem,
+    Region,
     Request,
     Response,
+    ScopeState,
+    TipStatus,
+    names,
 )
 from afspm.model.events import MeasurementSettings
 from afspm.model.sweep_plan import SweptValues
@@ -288,3 +292,109 @@ def test_target_that_another_set_while_control_was_lost_is_set_again() -> None:
     sweep(scope_of(lab), None, {"source.bias": ["4.2 V", "10 V"]})
     assert lab.at_volt == ["4.2", "10"]
     assert lab.targets == ["10", "10", "4.2"]
+
+
+class TipLab(SourceLab):
+    """Notes where the tip is at each new target and each scan; a scan of a withdrawn tip is refused."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.is_engaged = True
+        self.noted: list[str] = []
+        self.publish(TipStatus(engaged=True))
+
+    def execute(self, request: Request) -> Response:
+        subject = request.subject
+        if isinstance(subject, Parameter) and subject.name == "source.bias" and subject.value is not None:
+            self.noted.append(f"{subject.value} {'engaged' if self.is_engaged else 'withdrawn'}")
+        if subject == names.START_SCAN and not self.is_engaged:
+            return Response(ControlResponse.ACTION_ERROR, reason="the tip is withdrawn")
+        if subject in (names.RETRACT, names.ENGAGE):
+            self.is_engaged = subject == names.ENGAGE
+            self.go(ScopeState.COARSE_MOTOR)
+            self.at(1.0, lambda: self.go(ScopeState.FREE))
+            self.at(2.0, lambda: self.publish(TipStatus(engaged=self.is_engaged)))
+            self.executed.append(request.id)
+            return Response(ControlResponse.SUCCESS)
+        return super().execute(request)
+
+    def finish_scan(self) -> None:
+        self.noted.append("scan")
+        super().finish_scan()
+
+
+def temperatures(scope: Scope) -> list[Any]:
+    with scope.sweep(BIASES, shape=(8, 8), key="series", withdraw=True) as points:
+        return list(points)
+
+
+WITHDRAWN_EACH_TIME = ["scan", "scan", "10 withdrawn", "scan", "scan", "4.2 withdrawn"]
+
+
+def test_tip_is_withdrawn_while_an_instrument_goes_to_its_target_and_stays_so_at_the_end() -> None:
+    lab = TipLab()
+    temperatures(scope_of(lab))
+    assert lab.noted == WITHDRAWN_EACH_TIME
+    assert not lab.is_engaged
+
+
+def test_killed_at_any_step_the_tip_is_withdrawn_at_each_target_and_back_for_each_scan() -> None:
+    for deadly_call in range(1, 1000):
+        lab = TipLab()
+        with TemporaryDirectory() as folder:
+            try:
+                temperatures(scope_of(lab, Path(folder), 0, LabPort(lab, deadly_call)))
+                break
+            except Kill9:
+                pass
+            lab.restart_component()
+            lab.publish(TipStatus(engaged=lab.is_engaged))
+            assert len(temperatures(scope_of(lab, Path(folder), 1))) == 4, deadly_call
+        if lab.noted[-2:] == 2 * lab.noted[-1:]:  # killed after the answer: the former target is set once more
+            lab.noted.pop()
+        assert lab.noted == WITHDRAWN_EACH_TIME, f"killed at call {deadly_call}"
+    assert deadly_call > 40
+
+
+def test_withdrawal_without_an_instrument_is_refused() -> None:
+    with pytest.raises(InvalidValue, match="none is swept"), scope_of(SweepLab()).sweep(SWEPT, withdraw=True) as points:
+        list(points)
+
+
+LOOP: dict[str, SweptValues] = {"tip-bias-voltage": ["0.1 V", "0.2 V", "0.1 V"]}
+HERE = Region((0.0, 0.0), (1e-6, 1e-6))
+THERE = Region((1e-6, 0.0), (1e-6, 1e-6))
+
+
+def test_loop_takes_a_list_of_scans_and_spectra_at_each_point_once_over_kills() -> None:
+    def loop(scope: Scope) -> list[Any]:
+        places = [(0.0, 0.0), (1e-7, 0.0)]
+        with scope.sweep(
+            LOOP, order="listed", repeat=2, measure="both", region=[HERE, THERE], shape=(8, 8), at=places, key="loop"
+        ) as points:
+            return [(one.point, one.number, one.of, one.key, one.values["tip-bias-voltage"]) for one in points]
+
+    once = loop(scope_of(SweepLab()))
+    volts = [0.1, 0.1, 0.2, 0.2, 0.1, 0.1]
+    assert once == [(n // 4 + 1, n + 1, 24, f"loop-{n + 1}", volts[n // 4]) for n in range(24)]
+    for deadly_call in range(5, 1000, 7):
+        lab = SweepLab()
+        with TemporaryDirectory() as folder:
+            try:
+                loop(scope_of(lab, Path(folder), 0, LabPort(lab, deadly_call)))
+                break
+            except Kill9:
+                pass
+            lab.restart_component()
+            assert loop(scope_of(lab, Path(folder), 1)) == once
+        assert [volt for volt, _ in lab.measured] == [str(volt) for volt in volts for _ in range(4)], deadly_call
+        assert len(lab.finished) == 12
+        assert lab.in_force == BEFORE
+
+
+def test_points_of_a_loop_are_published_with_their_numbers() -> None:
+    lab = SweepLab()
+    with scope_of(lab).sweep(LOOP, order="listed", shape=(8, 8)) as points:
+        list(points)
+    messages = [wire.decode(one.message, one.payload) for one in lab.told("MeasurementSettings")]
+    assert [one.point for one in messages if isinstance(one, MeasurementSettings)] == [1, 2, 3, None]

@@ -13,6 +13,7 @@ from afspm.basics.exit_codes import ExitCode
 from afspm.components.sweep import Sweep
 from afspm.experiment.planned_measurements import plan_of, refusals
 from afspm.scheduler.safety.limits import ExperimentLimits, Limit
+from afspm.storage.memory import Memory
 
 BIAS = {"tip-bias-voltage": ["0.1 V", "0.2 V", "0.3 V"]}
 
@@ -47,6 +48,34 @@ def test_killed_sweep_measures_only_the_remaining_points(tmp_path: Path) -> None
         assert not list((folder / "sweep.results").glob("*")), "what is kept of each point is removed"
 
 
+def test_loop_with_a_grid_at_each_point_goes_on_after_a_kill(tmp_path: Path) -> None:
+    loop = {"tip-bias-voltage": ["0.1 V", "0.2 V", "0.1 V"]}
+    grid = {"counts": (2, 1), "spacing": (1e-8, 1e-8)}
+    regions = [{"center": (0.0, 0.0), "size": (1e-6, 1e-6)}]
+
+    def component() -> Sweep:
+        return sweep(loop, order="listed", measure="both", regions=regions, grid=grid, pixels=(8, 8))
+
+    for deadly_call in range(5, 80, 15):
+        lab, folder = Lab("sweep"), tmp_path / str(deadly_call)
+        with pytest.raises(Kill9):
+            life(lab, folder, "0", component(), deadly_call)
+        lab.restart_component()
+        assert life(lab, folder, "1", component()) == ExitCode.ENDED
+        assert lab.begun_scans == 9, deadly_call  # a scan and two spectra at each of three points
+    work = component().planned_work(1e-6)
+    assert work is not None
+    assert (work.scans, work.spectra) == (3, 6)
+
+
+def test_plan_saved_before_points_could_repeat_is_gone_on_with(tmp_path: Path) -> None:
+    lab = Lab("sweep")
+    with pytest.raises(Kill9):
+        life(lab, tmp_path, "0", sweep(), 35)
+    saved = Memory(tmp_path / "sweep.json")
+    assert saved["sweep"].keys() == {"axes", "order", "seed", "measure"}
+
+
 def test_sweep_refuses_other_values_than_it_was_begun_with(tmp_path: Path) -> None:
     lab = Lab("sweep")
     with pytest.raises(Kill9):
@@ -65,6 +94,14 @@ def test_sweep_refuses_other_values_than_it_was_begun_with(tmp_path: Path) -> No
         ({"at": (0.0, 0.0)}, "at"),
         ({"measure": "spectrum", "size": (1e-6, 1e-6)}, "size"),
         ({"center": (0.0, 0.0)}, "center"),
+        ({"measure": "spectrum", "regions": [{"size": (1e-6, 1e-6)}]}, "regions"),
+        ({"grid": {"counts": (2, 2), "spacing": (1e-8, 1e-8)}}, "grid"),
+        ({"measure": "both", "at": (0.0, 0.0), "positions": [(0.0, 0.0)]}, "positions"),
+        ({"regions": [{"size": (1e-6, 1e-6)}], "size": (1e-6, 1e-6)}, "size"),
+        ({"measure": "spectrum", "positions": []}, "positions"),
+        ({"withdraw": True}, "withdraw"),
+        ({"repeat": 0}, "repeat"),
+        ({"parameters": {"tip-bias-voltage": [1.0, 2.0, 1.0]}}, "parameters.tip-bias-voltage"),
         ({"parameters": {}}, "parameters"),
         ({"parameters": {"tip-bias-voltage": ["1 nm"]}}, "parameters.tip-bias-voltage"),
         ({"parameters": {"scan-size-x": ["1 nm"]}, "size": (1e-6, 1e-6)}, "parameters.scan-size-x"),

@@ -182,9 +182,11 @@ def test_export_has_the_key_of_a_scan(night: Night, store: RecordStore, tmp_path
     assert ",tile-1" in (tmp_path / "csv" / "scans.csv").read_text(encoding="utf-8")
 
 
-def settings(night: Night, gain: str, key: str = "", who: str = "series", speed: str = "2") -> Given:
+def settings(
+    night: Night, gain: str, key: str = "", who: str = "series", speed: str = "2", point: int | None = None
+) -> Given:
     parameters = (Parameter("zctrl-igain", gain), Parameter("scan-speed", speed, "um/s")) if gain else ()
-    return night.packet(MeasurementSettings(night.now_ns, who, parameters, key))
+    return night.packet(MeasurementSettings(night.now_ns, who, parameters, key, point))
 
 
 def test_swept_parameters_are_columns_of_the_scans(night: Night, store: RecordStore, tmp_path: Path) -> None:
@@ -241,14 +243,38 @@ def test_a_contact_sheet_shows_the_sweep(night: Night, store: RecordStore, tmp_p
         store.take([settings(night, gain, speed=speed), *night.whole_scan(number)])
     with afspm.open_run(tmp_path) as run:
         (named,) = sweep_sheet.figures(run, "night")
-        rows = [(row.settings, run.scan(row).first) for row in run.scans if row.settings]
     assert named[0] == "sweep"
     named[1].savefig(tmp_path / "sweep.png")
     assert (tmp_path / "sweep.png").stat().st_size > 10_000
-    across, down = (sweep_sheet._sorted(one[part] for one, _ in rows) for part in (slice(-1, None), slice(None, -1)))
-    assert [each[0].text for each in across] == ["1 µm/s", "2 µm/s"]
-    assert [each[0].text for each in down] == ["5", "70"]
+    across = [text.get_text() for text in named[1].texts]
+    assert across[-4:] == ["1 µm/s", "2 µm/s", "5", "70"]
     assert len(named[1].axes) == 4 + 1, "one colour bar"
+
+
+@pytest.mark.parametrize(
+    ("speeds", "columns"),
+    [(["1", "2", "1"], ["1 µm/s", "2 µm/s", "1 µm/s"]), (["2", "2", "1", "1"], ["1 µm/s"] * 2 + ["2 µm/s"] * 2)],
+)
+def test_contact_sheet_has_a_column_for_each_point_of_equal_value(
+    night: Night, store: RecordStore, tmp_path: Path, speeds: list[str], columns: list[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    from afspm.report import sweep_sheet
+
+    rows = [("5", speeds), ("70", speeds if len(speeds) == 3 else speeds[::-1])]  # a loop, or a snake of repeats
+    points = [(gain, speed) for gain, along in rows for speed in along]
+    store.take([night.control()])
+    for number, (gain, speed) in enumerate(points, 1):
+        store.take([settings(night, gain, speed=speed, point=number), *night.whole_scan(2 * number)])
+        store.take([settings(night, gain, speed=speed, point=number), *night.whole_scan(2 * number + 1)])
+    with afspm.open_run(tmp_path) as run:
+        sheets = dict(sweep_sheet.figures(run, "night"))
+        assert run.scans.columns()["point"] == [1 + n // 2 for n in range(2 * len(points))]
+    assert list(sheets) == ["sweep", "sweep_2"], "each scan of a point has a sheet"
+    for figure in sheets.values():
+        texts = [text.get_text() for text in figure.texts]
+        assert texts[-len(columns) - 2 :] == [*columns, "5", "70"]
+        assert sum(bool(axes.images) for axes in figure.axes) == len(points)
 
 
 def test_row_without_contrast_has_a_scale_of_its_own() -> None:
@@ -260,7 +286,7 @@ def test_row_without_contrast_has_a_scale_of_its_own() -> None:
 
     def ranges(*, largest_m: float) -> list[tuple[float, float]]:
         scans = [
-            ((SweptSetting("gain", gain, ""), SweptSetting("scan-speed", speed, "m/s")),
+            (sweep_sheet.Panel((SweptSetting("gain", gain, ""), SweptSetting("scan-speed", speed, "m/s"))),
              Scan(REGION, "Height", "m", height_m * noise[row, column], 0, ""))
             for row, (gain, height_m) in enumerate([(5.0, 1e-9), (70.0, largest_m)])
             for column, speed in enumerate([1e-6, 2e-6])
