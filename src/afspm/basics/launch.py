@@ -85,6 +85,8 @@ class Launch:
     """For a translator: parameters that may be set during a scan."""
     solved: tuple[str, ...] = ()
     """For a scheduler: the problems that components of the run solve."""
+    after: tuple[str, ...] = ()
+    """Components that must be done before the script of this component begins."""
     keeps_requests: bool = False
     """Record inputs and requests of the process, for a replay by `afspm what-if`."""
 

@@ -64,7 +64,9 @@ def check(
             console.print(line, markup=False, soft_wrap=True)
         console.print(_summary(experiment, findings), markup=False, soft_wrap=True)
         if not any(finding.is_error for finding in findings):
-            for line in estimate_lines(experiment.planned_work(), experiment.clock().speed, datetime.now(UTC)):
+            for line in estimate_lines(
+                experiment.planned_work(), experiment.clock().speed, datetime.now(UTC), experiment.order()
+            ):
                 console.print(line, markup=False, soft_wrap=True)
             for line in experiment.waits():
                 console.print(line, markup=False, soft_wrap=True)
@@ -237,20 +239,27 @@ COMPUTING_S = 0.1
 """Real time between two scans without a period: 0.04 to 0.14 s, measured on an idle computer of two cores."""
 
 
-def estimate_lines(works: Mapping[str, PlannedWork | None], speed: float, now: datetime) -> Iterator[str]:
+def estimate_lines(
+    works: Mapping[str, PlannedWork | None],
+    speed: float,
+    now: datetime,
+    order: Mapping[str, Sequence[str]] | None = None,
+) -> Iterator[str]:
     """Yield a line about the planned work of each component, then a line about the expected end if it is known.
 
     Args:
         speed: experiment seconds per real second.
         now: start of the experiment, real time.
+        order: the components after which each component begins.
     """
     from afspm.model.planned_work import planned_end_s
 
     for name, work in works.items():
+        after = f", after {' and '.join(before)}" if (before := (order or {}).get(name)) else ""
         yield (
-            f"how long {name} works is not known: its class does not plan its work"
+            f"how long {name} works is not known: its class does not plan its work{after}"
             if work is None
-            else f"{name} plans {work_text(work)}"
+            else f"{name} plans {work_text(work)}{after}"
         )
     end_s = planned_end_s(works.values())
     if end_s is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 
 from afspm.basics import Angle, RequestError
 from afspm.basics.errors import ConfigError, Refused
@@ -38,6 +38,7 @@ class SpectroscopyGrid(Component):
         curve: settings of the curves, as in `curve_parameters`: {sweep = ["-500 mV", "500 mV"], points = 201,
             lock_in = {amplitude = "10 mV"}}; set back at the end.
         repeats: number of spectra at each point.
+        keep_control: whether to keep control between spectra; by default others may measure meanwhile.
         end_when_done: whether to end the whole experiment after the last spectrum.
     """
 
@@ -53,6 +54,7 @@ class SpectroscopyGrid(Component):
         kind: str | None = None,
         curve: CurveTable | None = None,
         repeats: int = 1,
+        keep_control: bool = False,
         end_when_done: bool = False,
     ) -> None:
         if (positions is None) == (counts is None):
@@ -83,7 +85,7 @@ class SpectroscopyGrid(Component):
             *(names.PROBE_POS_X, names.PROBE_POS_Y, *([names.SPEC_KIND] if kind else [])),
             *of_curves,
         )
-        self.repeats = repeats
+        self.repeats, self.keep_control = repeats, keep_control
         self.end_when_done = end_when_done
 
     def planned_work(self, speed_m_s: float | None) -> PlannedWork:
@@ -91,7 +93,8 @@ class SpectroscopyGrid(Component):
         return PlannedWork(spectra=spectra, ends_experiment=self.end_when_done, why=why)
 
     def run(self) -> None:
-        with self.scope.curves(self.curve, kind=self.kind, key="curve"):
+        kept = self.scope.control() if self.keep_control else nullcontext()
+        with kept, self.scope.curves(self.curve, kind=self.kind, key="curve"):
             refused = self._measure()
         if refused:
             self.log.error("%d of %d spectra were refused", refused, len(self.positions) * self.repeats)

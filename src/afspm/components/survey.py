@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
@@ -84,6 +85,7 @@ class Survey(Component):
         refine: whether to find the target again in its zoom, so that curves are taken at its place there.
         parameters: parameters to set before the survey, e.g. {scan-speed = "10 um/s"}.
         zoom_parameters: parameters to set before the zooms.
+        keep_control: whether to keep control between measurements; by default others may measure meanwhile.
         end_when_done: whether to end the whole experiment after the last target.
         file: name of the table and of the picture in the run folder, without suffix.
     """
@@ -114,6 +116,7 @@ class Survey(Component):
         refine: bool = True,
         parameters: dict[str, str | float] | None = None,
         zoom_parameters: dict[str, str | float] | None = None,
+        keep_control: bool = False,
         end_when_done: bool = False,
         file: str = "targets",
     ) -> None:
@@ -146,6 +149,7 @@ class Survey(Component):
                 raise ConfigError(f"{lengths_text([value])} is below zero", where=name)
         separation_m = half_m if separation is None else separation
         self.finder = TargetFinder(targets, count, min_height, separation_m, min(self._wide.region.size_m), refine)
+        self.keep_control = keep_control
         self._record: SurveyRecord | None = None
         self._refused: Refused | None = None
         self._needs(dict.fromkeys((*self._wide.parameters, *self._closer.parameters)))
@@ -173,6 +177,7 @@ class Survey(Component):
 
     def run(self) -> None:
         with (
+            self.scope.control() if self.keep_control else nullcontext(),
             self.scope.curves(self.curve, kind=self.kind, key="curve"),
             self.scope.events(MAPPING, timeout_s=0.0) as mappings,
         ):

@@ -183,6 +183,10 @@ class Experiment:
         """
         return process_starts.asking(self.resolved, names)
 
+    def order(self) -> dict[str, tuple[str, ...]]:
+        """Return the components after which each component begins."""
+        return {name: process.after for name, process in self.resolved.processes.items()}
+
     def planned_work(self) -> dict[str, PlannedWork | None]:
         """Return the planned work of each component that acts on its own; None: no estimate."""
         plans = self.resolved.plans

@@ -117,6 +117,7 @@ class _Drawing:
         declared = self.resolved.processes[part.name].declared
         what = part.class_path.rpartition(".")[2] if part.class_path else " ".join(part.command)
         lines = [(what if len(what) <= 34 else what[:33] + "…", GREY)]
+        lines += [(f"after {other}", GREY) for other in self.resolved.processes[part.name].after]
         lines += [(f"flags {problem}", RED) for problem in declared.flags]
         lines += [(f"solves {problem}", GREEN) for problem in declared.solves]
         labels = self._from_scheduler(part)

@@ -21,7 +21,7 @@ SECTIONS: Final = (
 
 # Keys of a component's table that are afspm's; all others are settings of its class or command.
 OWN_KEYS: Final = frozenset(
-    {"component", "class", "command", "envelopes", "listens_to", "role", "heartbeats", *WIRE_KEYS}
+    {"component", "class", "command", "envelopes", "listens_to", "after", "role", "heartbeats", *WIRE_KEYS}
 )
 SIMULATED = "simulated"
 """Marks a simulated microscope: an attribute of its class, or a key in the table of a command."""

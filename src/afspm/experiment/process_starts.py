@@ -201,6 +201,7 @@ def _start(
         sample_coordinates=role is Role.COMPONENT and _in_sample_coordinates(resolved),
         retracts=role is Role.TRANSLATOR and _retracts_when_released(resolved),
         adjustable=control.adjustable if role is Role.TRANSLATOR else (),
+        after=process.after,
         keeps_requests=resolved.sections.record.requests and role is not Role.TRANSLATOR,
     )
     folders = resolved.document.folders

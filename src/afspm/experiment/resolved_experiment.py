@@ -80,6 +80,12 @@ class ResolvedProcess:
             return self.declared.listens
         return (wanted,) if isinstance(wanted, str) else tuple(map(str, wanted))
 
+    @property
+    def after(self) -> tuple[str, ...]:
+        """The components that must be done before this component begins."""
+        names = self.part.own.get("after", ())
+        return (names,) if isinstance(names, str) else tuple(map(str, names))
+
     def capabilities(self) -> MicroscopeCapabilities | None:
         """Return a translator's capabilities; None if they can't be known before it runs."""
         return None if self.component is None else capabilities.of_class(self.component, self.settings)

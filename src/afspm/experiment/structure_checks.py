@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 import re
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from itertools import filterfalse
 from pathlib import Path
 from typing import Final
@@ -205,6 +205,48 @@ def check_listens_to(resolved: ResolvedExperiment) -> None:
                 resolved.document.error(what, *path, hint=nearest(str(other), publishers))
             elif other not in publishers:
                 resolved.document.error(f"[{name}] listens to [{other}], which publishes nothing", *path)
+
+
+def check_order(resolved: ResolvedExperiment) -> None:
+    """Require that `after` names plans that end by themselves, and forms no circle."""
+    document, processes = resolved.document, resolved.processes
+    scripts = [name for name, one in processes.items() if one.component is not None and _is_script(one.component)]
+    for name, process in processes.items():
+        if process.after and name not in scripts:
+            what = f"[{name}] has `after`, and is no plan: it handles messages from the start on"
+            document.error(what, name, "after", hint="only a component with a method `run` begins later")
+            continue
+        for other in process.after:
+            if other not in processes:
+                hint = nearest(other, scripts)
+                document.error(f"[{name}] after: there is no component {other!r}", name, "after", hint=hint)
+            elif other not in scripts:
+                document.error(f"[{name}] begins after [{other}], which is no plan, and never done", name, "after")
+            elif processes[other].settings.get("end_when_done"):
+                what = f"[{name}] begins after [{other}], which ends the experiment when it is done"
+                document.error(what, name, "after", hint=f"remove end_when_done of [{other}]")
+    if ring := _ring({name: processes[name].after for name in scripts}):
+        document.error(f"`after` forms a circle: {' after '.join((*ring, ring[0]))}", ring[0], "after")
+
+
+def _is_script(component: type) -> bool:
+    return issubclass(component, Component) and component.run is not Component.run
+
+
+def _ring(after: Mapping[str, Sequence[str]]) -> list[str]:
+    # the first circle, from its name that comes first in the file; empty without a circle
+    for start in after:
+        way, left = [start], [list(after[start])]
+        while left:
+            if not left[-1]:
+                way.pop()
+                left.pop()
+            elif (name := left[-1].pop(0)) == start:
+                return way
+            elif name in after and name not in way:
+                way.append(name)
+                left.append(list(after[name]))
+    return []
 
 
 def shared_files(resolved: ResolvedExperiment, names: Collection[str]) -> Iterator[Finding]:
@@ -607,6 +649,7 @@ CHECKS: Final[tuple[Check, ...]] = (
     *ALWAYS,
     check_addresses,
     check_listens_to,
+    check_order,
     check_problems,
     check_envelopes,
     check_measures,

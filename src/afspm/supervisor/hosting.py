@@ -14,6 +14,7 @@ from afspm.basics.clock import Clock, ExperimentClock
 from afspm.basics.errors import ConfigError
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.launch import Launch
+from afspm.model import ProcessStates
 from afspm.transport import Port
 from afspm.transport.heartbeat import HeartbeatSender
 from afspm.transport.network import Network
@@ -127,7 +128,8 @@ def _open_port(launch: Launch, clock: Clock, parent: ParentWatch, heard: tuple[s
     if heard is not None:
         envelopes = heard
     elif launch.sockets.control is not None:
-        envelopes = tuple(sorted({*envelopes, *wire.followed_messages()}))
+        of_loop = (*wire.followed_messages(), *([ProcessStates.__name__] if launch.after else []))
+        envelopes = tuple(sorted({*envelopes, *of_loop}))
     launch = replace(launch, envelopes=envelopes)
     port = open_port(launch, clock)
     parent.when_gone(lambda: port.wake_up(ParentGone()))

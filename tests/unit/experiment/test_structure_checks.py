@@ -16,6 +16,7 @@ CLASSIFIER = '[watch]\ncomponent = true\nclass = "parts.Classifier"\n'
 CORRECTOR = '[repair]\ncomponent = true\nclass = "parts.Corrector"\n'
 PEAKS = '[peaks]\ncomponent = true\nclass = "parts.Peaks"\n'
 LOG = '[log]\ncomponent = true\nclass = "parts.Listener"\n'
+GRID_AFTER = '[grid]\ncomponent = true\nclass = "SpectroscopyGrid"\npositions = [["0 nm", "0 nm"]]\nafter = ["{a}"]\n'
 PAGE = '[page]\ncomponent = true\nclass = "Dashboard"\n'
 CHOOSER = '[choose]\ncomponent = true\nclass = "parts.Chooser"\n'
 ANYTHING = '[any]\ncomponent = true\nclass = "parts.Anything"\n'
@@ -182,6 +183,21 @@ BROKEN = {
     ),
     "to itself by its name": (PEAKS + 'listens_to = ["peaks"]\n', FRAME, "subscribes to itself"),
     "to somebody unknown": (ANYTHING + 'listens_to = ["peak"]\n' + PEAKS, FRAME, "no component 'peak'"),
+    "begins after itself": (GRID_AFTER.format(a="grid"), FRAME, "circle: grid after grid"),
+    "begins in a circle": (
+        GRID_AFTER.format(a="grid_b") + GRID_AFTER.format(a="grid").replace("[grid]", "[grid_b]"),
+        FRAME, "circle: grid after grid_b after grid",
+    ),
+    "begins after nothing": (GRID_AFTER.format(a="gird"), FRAME, "no component 'gird'"),
+    "begins after what never ends": (GRID_AFTER.format(a="scheduler"), FRAME, "no plan, and never done"),
+    "begins after the end": (
+        GRID_AFTER.format(a="grid_b")
+        + GRID_AFTER.replace("[grid]", "[grid_b]").replace('after = ["{a}"]', "end_when_done = true"),
+        FRAME, "ends the experiment when it is done",
+    ),
+    "no plan begins after a plan": (
+        '[meta]\ncomponent = true\nclass = "Metadata"\nafter = ["meta"]\n', FRAME, "handles messages from the start on"
+    ),
     "to somebody silent": (ANYTHING + 'listens_to = ["repair"]\n' + CORRECTOR, FRAME, "publishes nothing"),
     "time made faster": ("[clock]\nspeed = 60\n", REAL, "not simulated"),
     "time set": ("[clock]\nstart = 2026-01-01T00:00:00Z\n", REAL, "[clock] start"),

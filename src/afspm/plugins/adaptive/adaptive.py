@@ -6,6 +6,7 @@ import csv
 import io
 import logging
 from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
@@ -57,6 +58,7 @@ class Adaptive(Component):
         coarsest: number of positions along the longer side of the first lattice, 3 to 9.
         levels: number of refinements, 1 to 9, each twice as fine as the last; those after the third are measured only
             between measured positions.
+        keep_control: whether to keep control between spectra; by default others may measure meanwhile.
         end_when_done: whether to end the whole experiment after the last spectrum.
         file: name of table and picture, without suffix.
     """
@@ -79,6 +81,7 @@ class Adaptive(Component):
         optimizer: str = "adaptive",
         coarsest: int = 5,
         levels: int = 5,
+        keep_control: bool = False,
         end_when_done: bool = False,
         file: str = "map",
     ) -> None:
@@ -97,7 +100,7 @@ class Adaptive(Component):
         of_curves = (one.name for one in self.planned_parameters["curve"])
         self.needs_parameters = (names.PROBE_POS_X, names.PROBE_POS_Y, *with_kind, *of_curves)
         self.positions = tuple((float(x), float(y)) for x, y in self._region.corners_m())
-        self.end_when_done, self.file = end_when_done, file
+        self.keep_control, self.end_when_done, self.file = keep_control, end_when_done, file
         self._progress: MapProgress | None = None
 
     def planned_work(self, speed_m_s: float | None) -> PlannedWork:
@@ -107,7 +110,8 @@ class Adaptive(Component):
         )
 
     def run(self) -> None:
-        with self.scope.curves(self.curve, kind=self.kind, key="curve"):
+        kept = self.scope.control() if self.keep_control else nullcontext()
+        with kept, self.scope.curves(self.curve, kind=self.kind, key="curve"):
             self._measure()
         if self.end_when_done:
             self.scope.end_experiment()
