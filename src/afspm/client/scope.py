@@ -14,6 +14,7 @@ from afspm import wire
 from afspm.basics import RequestError
 from afspm.basics.errors import ExperimentEnded, InvalidValue, Refused
 from afspm.basics.plain_data import Plain
+from afspm.basics.units import si_or_text
 from afspm.client.command_retry import CommandRetry, refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.events import Events, PublishedEvent
@@ -26,6 +27,7 @@ from afspm.client.measurement import MeasurementRunner
 from afspm.client.measurement_setup import MeasurementSetup
 from afspm.client.parameter_text import Value, to_parameter, value_in
 from afspm.client.sweeping import Measure, ParameterSweep, SweepPoint, values_between
+from afspm.client.sweeping_at import PlacedSweep, PlacedSweeper
 from afspm.client.targets import ScanTarget, SpectrumTarget, Target, xy_of
 from afspm.client.withdrawal import Withdrawal
 from afspm.model import (
@@ -55,7 +57,7 @@ from afspm.model.curve_request import CurveSettings, curve_parameters
 from afspm.model.events import HasTime
 from afspm.model.instruments import InstrumentOrders, is_of_instrument, newest_of
 from afspm.model.sessions import KEYED
-from afspm.model.sweep_plan import SweepOrder, SweepPlan, SweptValues
+from afspm.model.sweep_plan import SweepAxis, SweepOrder, SweepPlan, SweptValues
 from afspm.transport.process.parent import StopRequested
 
 __all__ = ["Events", "PublishedEvent", "Scope"]
@@ -328,6 +330,58 @@ class Scope(ExperimentView):
                 yield self._each_in_a_call(sweep.points(done, until_s))
             finally:
                 self._sweeps = False
+
+    @checked_call
+    def sweep_at(
+        self,
+        parameter: str,
+        values: SweptValues,
+        read: str | Sequence[str],
+        *,
+        at: Place | None = None,
+        settle: float | str = 0.0,
+        kind: str | None = None,
+        key: str | None = None,
+        publish: Callable[[object, str | None], None] | None = None,
+        timeout_s: float | None = None,
+    ) -> Spectrum:
+        """Set a parameter to each value at one place, read others after each set, and return all as a spectrum.
+
+            scope.sweep_at("lab.rf", {"from": "13 GHz", "to": "17 GHz", "points": 101}, read="lab.x", settle="30 ms")
+
+        The parameters are those of the microscope or of other instruments. Each reading is taken after its set: an
+        instrument first arrives at its target, then `settle` passes, then each instrument measures. The variables of
+        the spectrum have the names of the parameters; the first is the one that was set, with its values in force.
+        Afterwards the parameter is set back. If control is lost on the way, the whole sweep is taken again.
+
+        Args:
+            values: a list, in this order, in which values may come again; or a range such as {"from": "13 GHz", "to":
+                "17 GHz", "points": 101}.
+            read: parameters to read after each set.
+            at: (x, y) in m or as text, to move the probe to; None: the present position.
+            settle: experiment time from each set to its readings, in s or as text.
+            kind: kind of the spectrum; by default the name of the parameter that is set.
+            key: name of the sweep, which is then taken only once in this run, as for `scan`.
+            publish: records the spectrum: `publish=self.publish` in a component with `publishes = ("Spec1d",
+                "MeasurementConditions")`. Without it the spectrum is only returned.
+
+        Raises:
+            InvalidValue: a value is no number, or the parameters to read are not valid.
+        """
+        axis, names = SweepAxis.of(parameter, values), (read,) if isinstance(read, str) else tuple(read)
+        target = SpectrumTarget.of(at, kind or parameter, self._frame)
+        sweep = PlacedSweep(axis, names, target, si_or_text(settle, "s"))
+        plan, key = SweepPlan((axis,), "listed"), key and check_key(key)
+        former = self._former([parameter], key, partial(values_between, plan))
+        sweeper = PlacedSweeper(self._link, self._control, self._commands, self._targets, self._setup, self._results)
+        with self._call():
+            until_s = self._link.until(timeout_s)
+            with self._control.hold(until_s=until_s, keeps=True), self._setting_back(former, timeout_s):
+                result = sweeper.take(sweep, key, former, until_s)
+                if publish is not None:
+                    publish(result.conditions, None)
+                    publish(result.spectrum, f"Spec1d_{result.spectrum.kind}")
+            return result.spectrum
 
     def _each_in_a_call(self, points: Iterator[SweepPoint]) -> Iterator[SweepPoint]:
         while True:

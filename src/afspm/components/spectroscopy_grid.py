@@ -42,7 +42,7 @@ class SpectroscopyGrid(Component):
         end_when_done: whether to end the whole experiment after the last spectrum.
     """
 
-    needs_actions = (names.START_SPEC,)
+    needs_actions: tuple[str, ...] = (names.START_SPEC,)
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class SpectroscopyGrid(Component):
             place, repeat = divmod(index, self.repeats)
             done, key = index + 1, f"spectrum-{place}-{repeat}"
             try:
-                self.scope.spectrum(self.positions[place], kind=self.kind, key=key)
+                self._take(self.positions[place], key)
             except Refused as refused:
                 done = (place + 1) * self.repeats
                 refusals.add(refused, done - index)
@@ -124,6 +124,9 @@ class SpectroscopyGrid(Component):
                 self.scope.forget(key)
             self.scope.progress(done, total, left_s=pace.left_s(done, total))
         return refusals.number
+
+    def _take(self, at_m: XY, key: str) -> None:
+        self.scope.spectrum(at_m, kind=self.kind, key=key)
 
     def _leave_out(self, at_m: XY, refused: Refused) -> None:
         message = f"the position {position_text(at_m)} is left out: {refused.reason}"

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -55,8 +56,9 @@ class Generator:
         return math.exp(-((self.ghz - PEAK_GHZ) ** 2))
 
 
-@pytest.fixture
-def scope(tmp_path: Path) -> Iterator[afspm.Scope]:
+@contextmanager
+def served() -> Iterator[int]:
+    """Serve generator and lock-in; yield the port."""
     sample: Any = loaded()
     generator = Generator()
     modules = {
@@ -65,7 +67,14 @@ def scope(tmp_path: Path) -> Iterator[afspm.Scope]:
     }
     with sample.Server(modules, port=0) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        text = EXPERIMENT.replace("PORT", str(server.server_address[1]))
+        yield server.server_address[1]
+        server.shutdown()
+
+
+@pytest.fixture
+def scope(tmp_path: Path) -> Iterator[afspm.Scope]:
+    with served() as port:
+        text = EXPERIMENT.replace("PORT", str(port))
         (tmp_path / "experiment.toml").write_text(text, encoding="utf-8")
         command = [sys.executable, "-m", "afspm", "run", "experiment.toml"]
         with (tmp_path / "run.txt").open("wb") as log:
@@ -78,7 +87,6 @@ def scope(tmp_path: Path) -> Iterator[afspm.Scope]:
             yield made
             made.end_experiment()
         run.wait(DEADLINE_S)
-        server.shutdown()
 
 
 def measured(scope: afspm.Scope, parameter: str) -> float:

@@ -23,6 +23,7 @@ from afspm.model import (
     Request,
     Response,
     ScopeState,
+    Spectrum,
     TipStatus,
     names,
 )
@@ -398,3 +399,88 @@ def test_points_of_a_loop_are_published_with_their_numbers() -> None:
         list(points)
     messages = [wire.decode(one.message, one.payload) for one in lab.told("MeasurementSettings")]
     assert [one.point for one in messages if isinstance(one, MeasurementSettings)] == [1, 2, 3, None]
+
+
+class EsrLab(SourceLab):
+    """A lock-in that reads the square of the source's voltage, wherever that is on its way."""
+
+    def execute(self, request: Request) -> Response:
+        response = super().execute(request)
+        subject = request.subject
+        if isinstance(subject, Parameter) and subject.name.removesuffix(".now") == "lockin.x":
+            return Response(0, wire.encode(Parameter("lockin.x", repr(float(self.values["source.bias"]) ** 2), "V"))[1])
+        return response
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.values["lockin.x"] = "0"
+
+
+VOLTS = ["5 V", "6 V", "7 V", "6 V"]
+
+
+def esr(scope: Scope, published: list[Any], key: str | None = "esr") -> Spectrum:
+    def publish(thing: object, envelope: str | None) -> None:
+        published.append(thing)
+
+    return scope.sweep_at("source.bias", VOLTS, "lockin.x", at=(1e-7, 0.0), settle="1 s", key=key, publish=publish)
+
+
+def test_sweep_at_a_place_reads_after_each_set_and_sets_back() -> None:
+    lab, published = EsrLab(), list[Any]()
+    spectrum = esr(scope_of(lab), published)
+    assert spectrum.names == ("source.bias", "lockin.x")
+    assert spectrum.values.tolist() == [[5.0, 25.0], [6.0, 36.0], [7.0, 49.0], [6.0, 36.0]]
+    assert (spectrum.kind, spectrum.position_m) == ("source.bias", (1e-7, 0.0))
+    conditions, same = published
+    assert same is spectrum
+    assert (conditions.holder, conditions.time_ns) == (lab.name, spectrum.time_ns)
+    assert conditions.began_ns < spectrum.time_ns - 4 * 10**9  # four settling times
+    assert lab.values["source.bias.target"] == "4.2"
+
+
+def test_sweep_at_a_place_is_taken_again_after_control_was_lost() -> None:
+    lab, published = EsrLab(), list[Any]()
+
+    def taken_over() -> None:
+        lab.flag(Problem.TIP_SHAPE_CHANGED)
+        lab.values |= {"source.bias.target": "77", "source.bias": "77", "source.bias.busy": "false"}
+
+    lab.at(3.5, taken_over)
+    lab.at(60.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    spectrum = esr(scope_of(lab), published)
+    assert spectrum["lockin.x"].tolist() == [25.0, 36.0, 49.0, 36.0]
+    assert lab.targets[:2] == ["5", "6"]
+    assert lab.targets[-5:] == ["5", "6", "7", "6", "4.2"]
+
+
+def test_killed_at_any_step_a_sweep_at_a_place_has_one_result_and_is_set_back() -> None:
+    for deadly_call in range(1, 1000, 2):
+        lab, published = EsrLab(), list[Any]()
+        with TemporaryDirectory() as folder:
+            try:
+                esr(scope_of(lab, Path(folder), 0, LabPort(lab, deadly_call)), published)
+                break
+            except Kill9:
+                pass
+            lab.restart_component()
+            again = esr(scope_of(lab, Path(folder), 1), published)
+            assert again["lockin.x"].tolist() == [25.0, 36.0, 49.0, 36.0], deadly_call
+        spectra = [one for one in published if isinstance(one, Spectrum)]
+        assert len({one.time_ns for one in spectra}) == 1, deadly_call
+        assert lab.values["source.bias.target"] == "4.2", deadly_call
+    assert deadly_call > 30
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        ({"values": ["on", "off"]}, "numbers"),
+        ({"read": []}, "set and read"),
+        ({"read": ["source.bias"]}, "set and read"),
+        ({"settle": "-1 s"}, "settling time"),
+    ],
+)
+def test_sweep_at_a_place_without_sense_is_refused(given: dict[str, Any], why: str) -> None:
+    with pytest.raises(InvalidValue, match=why):
+        scope_of(EsrLab()).sweep_at(**({"parameter": "source.bias", "values": VOLTS, "read": ["lockin.x"]} | given))

@@ -557,3 +557,13 @@ def test_readings_are_as_old_as_real_time_says(night: Night, tmp_path: Path) -> 
     assert found.value == 4.2
     assert found.age_s == pytest.approx(10.25, abs=0.1)
     assert run.about(row)["instruments"][0]["age_s"] == pytest.approx(found.age_s)
+
+
+def test_spectrum_that_a_component_publishes_again_after_a_kill_is_recorded_once(
+    night: Night, store: RecordStore, tmp_path: Path
+) -> None:
+    once, _ = night.spectrum()
+    again = replace(once, time_ns=(once.time_ns or 0) + 1_000_000)
+    store.take([(once, "esr"), (again, "esr")])
+    store.take([(replace(again, time_ns=(again.time_ns or 0) + 1), "esr")])
+    assert len(afspm.open_run(tmp_path).spectra) == 1
