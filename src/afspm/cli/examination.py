@@ -85,6 +85,7 @@ def _file(experiment: Experiment) -> Iterator[Diagnosis]:
         for translator in experiment.resolved.with_role(Role.TRANSLATOR):
             if (has := translator.capabilities()) is not None:
                 yield diagnosis.fine("channels", translator.name, f"it may have {has.channels.described()}")
+                yield diagnosis.fine("bias", translator.name, has.bias.text)
             for lost in experiment.resolved.lost_without():
                 what, _, hint = lost.partition("; ")
                 yield Diagnosis("withdrawal", Severity.WARNING, translator.name, what, hint)

@@ -7,7 +7,7 @@ from afspm.basics.argument_checks import FINITE, is_text, plain
 from afspm.basics.errors import InvalidValue, UnitError
 from afspm.basics.units import convert, parse_quantity, require_unit
 from afspm.model import Parameter, Response
-from afspm.model.parameter_names import BASE_PARAMETERS
+from afspm.model.parameter_names import UNITS_OF_REQUESTS
 
 Value = float | str | bool
 
@@ -30,14 +30,14 @@ def to_parameter(name: str, value: Value, unit: str | None) -> Parameter:
         if unit is None and value[:1] in "+-.0123456789" and (quantity := _quantity(value)) is not None:
             number, given = quantity
             if not given:
-                require_unit(number, BASE_PARAMETERS.get(name) or "")
-            return Parameter(name, repr(number), given or BASE_PARAMETERS.get(name))
+                require_unit(number, UNITS_OF_REQUESTS.get(name) or "")
+            return Parameter(name, repr(number), given or UNITS_OF_REQUESTS.get(name))
         return Parameter(name, value, unit)
     if unit is None:
-        require_unit(value, BASE_PARAMETERS.get(name) or "")
+        require_unit(value, UNITS_OF_REQUESTS.get(name) or "")
     # the repr of a numpy number is "np.float64(…)"
     text = repr(int(value)) if isinstance(value, int) else repr(float(value))
-    return Parameter(name, text, BASE_PARAMETERS.get(name) if unit is None else unit)
+    return Parameter(name, text, UNITS_OF_REQUESTS.get(name) if unit is None else unit)
 
 
 def from_parameter(parameter: Parameter, unit: str | None) -> Value:
@@ -55,7 +55,7 @@ def from_parameter(parameter: Parameter, unit: str | None) -> Value:
         number = float(text)
     except ValueError:
         return text
-    wanted = BASE_PARAMETERS.get(parameter.name) if unit is None else unit
+    wanted = UNITS_OF_REQUESTS.get(parameter.name) if unit is None else unit
     if not parameter.unit or not wanted:
         return number
     return convert(number, parameter.unit, wanted)

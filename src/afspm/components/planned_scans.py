@@ -31,7 +31,7 @@ from afspm.components.scan_plan import (
     rounds_within,
 )
 from afspm.model import Region, ScanSet, ScopeState, ScopeStatus, names
-from afspm.model.parameter_names import BASE_PARAMETERS
+from afspm.model.parameter_names import UNITS_OF_REQUESTS
 from afspm.model.planned_work import PlannedWork, planned_rounds
 
 Pixels = tuple[int, int]
@@ -491,7 +491,7 @@ def checked_parameters(given: Mapping[str, str | float] | None, where: str) -> d
     for name, quantity in parameters.items():
         try:
             parameter = to_parameter(name, quantity, None)
-            if parameter.unit and (si_unit := BASE_PARAMETERS.get(name)):
+            if parameter.unit and (si_unit := UNITS_OF_REQUESTS.get(name)):
                 convert(1.0, parameter.unit, si_unit)
         except (InvalidValue, UnitError) as error:
             raise ConfigError(error.what, where=f"{where}.{name}", hint=error.hint) from error

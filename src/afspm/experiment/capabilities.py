@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from afspm.basics.errors import AfspmError, InvalidValue, Refused
 from afspm.experiment.toml_lines import Table
 from afspm.model import ChannelRoles, Parameter, Region, names
+from afspm.model.bias import BiasReference
 
 if TYPE_CHECKING:
     from afspm.translator.driver import Driver
@@ -26,6 +27,7 @@ class MicroscopeCapabilities:
         max_pixels: the largest number of pixels of a scan.
         channels: the channels that the microscope may have, by their roles.
         never_withdrawn: actions that need a withdrawn tip, if the microscope never shows the tip.
+        bias: the reference of the bias.
         refused_commands: the reasons and remedies why the microscope refuses commands, by the action's name.
     """
 
@@ -35,6 +37,7 @@ class MicroscopeCapabilities:
     table: ParameterTable
     channels: ChannelRoles
     max_pixels: int
+    bias: BiasReference
     never_withdrawn: tuple[str, ...] = ()
     refused_commands: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
@@ -79,11 +82,18 @@ def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None
         commanded, refused = _commanded_by(microscope, added, table)
         sets = {name: (*_set_by(what, table), *commanded.get(name, ())) for name, what in added.items()}
         never = microscope.never_withdrawn(settings)
+        bias = microscope.bias_of(settings, table)
     except (AfspmError, AttributeError):
         return None  # the check of its settings reports the error in the table
     units = {name: table[name].si_unit for name in table}
     most = acting.max_pixels
-    return MicroscopeCapabilities(frozenset(actions), units, sets, table, channels, most, never, refused)
+    return MicroscopeCapabilities(frozenset(actions), units, sets, table, channels, most, bias, never, refused)
+
+
+def bias_given(settings: Table) -> BiasReference:
+    """Return the reference of the bias in the file, for a microscope of unknown capabilities."""
+    given = settings.get("bias_reference")
+    return BiasReference(given, may_have_second=True) if given in ("sample", "tip") else BiasReference()
 
 
 def _set_by(action: object, table: ParameterTable) -> tuple[Parameter, ...]:

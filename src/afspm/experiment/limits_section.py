@@ -46,6 +46,7 @@ from afspm.experiment.sections import Section, parse
 from afspm.experiment.toml_lines import Table
 from afspm.experiment.validation_messages import name_of, report
 from afspm.model import Parameter, Region, component_of, names
+from afspm.model.bias import BiasReference
 from afspm.model.instruments import instrument_of
 from afspm.scheduler import ExperimentLimits
 from afspm.scheduler.safety import rule_language
@@ -90,7 +91,8 @@ class RoleSection(Section):
 
 
 _SWEPT: Final = (
-    *(names.TIP_BIAS_VOLTAGE, *names.SPEC_ENDS, *names.SPEC_Z_ENDS, names.SPEC_Z_OFFSET, names.LOCK_IN_AMPLITUDE),
+    *(names.TIP_BIAS_VOLTAGE, names.BIAS_OF_SAMPLE, *names.SPEC_ENDS, *names.SPEC_Z_ENDS),
+    *(names.SPEC_Z_OFFSET, names.LOCK_IN_AMPLITUDE),
 )
 _OWN: Final = (*LimitsSection.model_fields, "actions", "roles", "forbid")
 _TYPES: Final = {
@@ -111,6 +113,7 @@ class LimitsReader:
         certain: whether `parameters` has all parameters, or only the base parameters and afspm's extensions.
         instruments: parameters of each other instrument, whose units are known only when the instrument runs.
         types: "bool" or "text" for parameters that are no numbers.
+        bias: the reference of the bias; limits on `sample-bias` become limits on `tip-bias-voltage`.
     """
 
     document: Document
@@ -121,6 +124,7 @@ class LimitsReader:
     certain: bool
     instruments: Mapping[str, Collection[str]] = field(default_factory=dict)
     types: Mapping[str, str] = field(default_factory=dict)
+    bias: BiasReference = field(default_factory=BiasReference)
 
     @property
     def _known_actions(self) -> frozenset[str]:
@@ -135,7 +139,8 @@ class LimitsReader:
         if not isinstance(actions, Mapping):
             self.document.error("[limits] actions is not a table", "limits", "actions")
             actions = {}
-        read = {name: limit for name, keys in parameters.items() if (limit := self._parameter(name, keys))}
+        given = {name: limit for name, keys in parameters.items() if (limit := self._parameter(name, keys))}
+        read = self._by_canonical_name(given, "limits")
         limits = ExperimentLimits(
             parameters=read,
             actions={name: limit for name, keys in actions.items() if (limit := self._action(name, keys))},
@@ -143,6 +148,7 @@ class LimitsReader:
             sets={action: parameters for action, parameters in self.sets.items() if parameters},
             roles=self._roles(table.get("roles", {}), read),
             forbid=self._forbid(table.get("forbid", [])),
+            bias=self.bias,
         )
         self._check_sizes(limits)
         return limits
@@ -158,7 +164,30 @@ class LimitsReader:
     def _known_parameters(self) -> list[str]:
         return [*self.parameters, *(parameter for parameters in self.instruments.values() for parameter in parameters)]
 
+    def _refuses_alias(self) -> tuple[str, str]:
+        # why nothing may be limited by the name `sample-bias`, and the remedy
+        if self.bias.may_have_second:
+            what = "sample-bias can't be limited where a second electrode has a voltage of its own (x-sample-bias)"
+            return what, 'limit the difference: forbid = ["abs(tip-bias-voltage - x-sample-bias) > 3 V"]'
+        what, _, hint = self.bias.unknown.partition("; ")
+        return what, hint
+
+    def _by_canonical_name(self, given: Mapping[str, Limit], *path: str) -> dict[str, Limit]:
+        read = dict(given)
+        alias, panel = read.pop(names.BIAS_OF_SAMPLE, None), read.get(names.TIP_BIAS_VOLTAGE)
+        if alias is None:
+            return read
+        alias = alias.times(self.bias.sign)
+        both = read[names.TIP_BIAS_VOLTAGE] = alias if panel is None else panel.narrowed(alias)
+        if both.low is not None and both.high is not None and both.low > both.high:
+            what = f"{name_of(path)}: no value is within the limits of both sample-bias and tip-bias-voltage"
+            self.document.error(what, *path, hint="they are one setting: limit one of them")
+        return read
+
     def _parameter(self, name: str, table: object) -> Limit | None:
+        if name == names.BIAS_OF_SAMPLE and (refused := self._refuses_alias())[0]:
+            self.document.error(f"[limits.{name}] {refused[0]}", "limits", name, hint=refused[1])
+            return None
         known = self._known_parameters
         if name not in known and (self.certain or not name.startswith("x-")):
             is_action = name in self._known_actions
@@ -244,12 +273,16 @@ class LimitsReader:
             self.document.error(f"[limits] forbid: {rule!r} is not a text", *path, hint=f'e.g. "{_EXAMPLE}"')
             return None
         try:
-            units = self._units_of(rule_language.parse(rule))
+            tree = rule_language.parse(rule)
+            has_alias = any(names.BIAS_OF_SAMPLE in one.names for one in rule_language.atoms(tree))
+            if has_alias and (refused := self._refuses_alias())[0]:
+                raise RuleError(refused[0], rule.index(names.BIAS_OF_SAMPLE), refused[1])
+            state = ForbiddenState(rule, source=str(self.document.place(*path)), bias_sign=self.bias.sign)
+            return replace(state, units=self._units_of(state.tree))
         except RuleError as error:
             at = self._place_in(rule, path, error.at)
             self.document.error(f"[limits] forbid, {at}: {error.what}", *path, hint=error.hint)
             return None
-        return ForbiddenState(rule, units, str(self.document.place(*path)))
 
     def _place_in(self, rule: str, path: tuple[str | int, ...], at: int) -> str:
         place, column = self.document.place(*path), -1
@@ -316,7 +349,9 @@ class LimitsReader:
             self.document.error(what, *path, hint=nearest(near, self.components))
         plain = dict(table) if isinstance(table, Mapping) else {}
         given = parse(RoleSection, ".".join(path), plain, self.document, path)
-        ranges = {name: self._range(name, pair, path) for name, pair in (given.parameters or {}).items()}
+        pairs = (given.parameters or {}).items()
+        ranges = {name: limit for name, pair in pairs if (limit := self._range(name, pair, path)) is not None}
+        ranges = self._by_canonical_name(ranges, *path, "parameters")
         unseen = {name for name, limit in limits.items() if limit.unseen_sweeps}
         places: list[tuple[str, tuple[str | int, ...]]] = [
             *((action, ("actions", number)) for number, action in enumerate(given.actions or ())),
@@ -332,9 +367,7 @@ class LimitsReader:
         return RoleLimits(
             ExperimentLimits(
                 parameters={
-                    parameter: replace(limit, unseen_sweeps=parameter in unseen)
-                    for parameter, limit in ranges.items()
-                    if limit is not None
+                    parameter: replace(limit, unseen_sweeps=parameter in unseen) for parameter, limit in ranges.items()
                 },
                 region=None if given.region is None else self._region(given.region, path),
                 region_source=source,
@@ -347,6 +380,9 @@ class LimitsReader:
 
     def _range(self, name: str, pair: tuple[Quantity, Quantity], path: tuple[str, ...]) -> Limit | None:
         place = (*path, "parameters", name)
+        if name == names.BIAS_OF_SAMPLE and (refused := self._refuses_alias())[0]:
+            self.document.error(f"[{'.'.join(path)}] {refused[0]}", *place, hint=refused[1])
+            return None
         if name not in (known := self._known_parameters):
             what = f"[{'.'.join(path)}] there is no parameter {name!r}"
             self.document.error(what, *place, hint=nearest(name, known))

@@ -25,9 +25,10 @@ from afspm.model import (
     is_of_instrument,
     names,
 )
+from afspm.model.bias import BiasReference
 from afspm.model.geometry import XY
 from afspm.model.planned_work import path_length_m
-from afspm.model.sweep_plan import SweepPlan
+from afspm.model.sweep_plan import SweepAxis, SweepPlan
 from afspm.scheduler import ExperimentLimits
 from afspm.scheduler.safety.forbidden_states import PlanRehearsal
 from afspm.scheduler.safety.limit_checker import LimitChecker
@@ -159,6 +160,28 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
         getattr(made, "workshop_center", None),
         getattr(getattr(made, "judge", None), "reference_scans", None),
     )
+
+
+def by_canonical_name(plan: PlannedMeasurements, bias: BiasReference) -> PlannedMeasurements:
+    """Return a plan with `tip-bias-voltage` in place of `sample-bias`.
+
+    Raises:
+        InvalidValue: it sets `sample-bias`, and the reference of the bias is not known.
+    """
+    if not plan.sets(names.BIAS_OF_SAMPLE) and names.BIAS_OF_SAMPLE not in plan.needs_parameters:
+        return plan
+    found = {key: tuple(map(bias.canonical, given)) for key, given in plan.parameters.items()}
+    needed = tuple(bias.canonical(Parameter(name)).name for name in plan.needs_parameters)
+    sweep = plan.sweep
+    if sweep is not None:
+        axes = tuple(_of_panel(axis, bias) if axis.name == names.BIAS_OF_SAMPLE else axis for axis in sweep.axes)
+        sweep = replace(sweep, axes=axes)
+    return replace(plan, parameters=found, needs_parameters=needed, sweep=sweep)
+
+
+def _of_panel(axis: SweepAxis, bias: BiasReference) -> SweepAxis:
+    values = tuple(value if isinstance(value, str) else bias.sign * value for value in axis.values)
+    return SweepAxis(names.TIP_BIAS_VOLTAGE, values, axis.unit)
 
 
 _PARAMETERS = ("parameters", "zoom_parameters", "initial")

@@ -29,7 +29,8 @@ from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedPro
 from afspm.experiment.sections import parse, read_sections
 from afspm.experiment.toml_lines import Table
 from afspm.experiment.wiring_classes import BoundSocket
-from afspm.model import STOPPED_BY_AGENT, ChannelRoles, PacketHeader, Parameter, ProblemNames, Role
+from afspm.model import STOPPED_BY_AGENT, ChannelRoles, PacketHeader, Parameter, ProblemNames, Role, names
+from afspm.model.bias import BiasReference
 from afspm.model.problems import HIGHEST_PROBLEM, QUIET_HOURS
 from afspm.scheduler.publishing.envelopes import CacheSettings, Envelopes
 
@@ -127,7 +128,10 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
     reader = limits_section.LimitsReader(
         document,
         components=resolved.processes.keys(),
-        parameters={**capabilities.base(), **({} if has is None else has.parameters)},
+        parameters={**capabilities.base(), **({} if has is None else has.parameters), names.BIAS_OF_SAMPLE: "V"},
+        bias=next((capabilities.bias_given(translator.settings) for translator in translators), BiasReference())
+        if has is None
+        else has.bias,
         instruments=resolved.instruments,
         actions=None if has is None else has.actions,
         sets={} if has is None else has.sets,
@@ -311,6 +315,11 @@ def _resolve_plan(
         resolved.document.error(f"[{name}] refuses its settings: {type(error).__name__}: {error}", name)
         return
     if plan is None:
+        return
+    try:
+        plan = planned_measurements.by_canonical_name(plan, resolved.limits.bias)
+    except AfspmError as error:
+        _report(name, error, resolved, ("parameters", names.BIAS_OF_SAMPLE))
         return
     process.declared = replace(
         process.declared, needs_actions=plan.needs_actions, needs_parameters=plan.needs_parameters

@@ -523,9 +523,11 @@ def check_needs(resolved: ResolvedExperiment) -> None:
                 ("action", declared.needs_actions, has.actions),
                 ("parameter", [*filterfalse(is_of_instrument, declared.needs_parameters)], has.parameters),
             ):
-                for missing in [name for name in needed if name not in offered]:
+                known = {*offered, *([names.BIAS_OF_SAMPLE] if has.bias.of else [])}
+                for missing in [name for name in needed if name not in known]:
                     what = f"[{name}] needs the {kind} {missing!r}, which [{translator.name}] does not have"
-                    resolved.document.error(what, name, hint=nearest(missing, offered))
+                    hint = has.bias.unknown if missing == names.BIAS_OF_SAMPLE else nearest(missing, offered)
+                    resolved.document.error(what, name, hint=hint)
 
 
 def check_treatments(resolved: ResolvedExperiment) -> None:

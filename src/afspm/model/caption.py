@@ -21,10 +21,12 @@ SPRING_CONSTANT: Final = "x-spring-constant"
 """Of the cantilever, in N/m."""
 SENSITIVITY: Final = "x-sensitivity"
 """Deflection of the cantilever over the voltage of its detector, in m/V."""
+BIAS_REFERENCE: Final = "bias-reference"
+"""Whether `tip-bias-voltage` is the bias of the "sample" or of the "tip"; no parameter, but a fact beside its value."""
 _LOCK_IN, _SPECTROSCOPY = "x-lock-in-", "x-spec-"
 _OF_ANY: Final = (
-    names.TIP_BIAS_VOLTAGE, names.SAMPLE_BIAS, names.ZCTRL_SETPOINT, names.SCAN_SPEED, names.FEEDBACK_ON,
-    SPRING_CONSTANT, SENSITIVITY,
+    names.TIP_BIAS_VOLTAGE, BIAS_REFERENCE, names.SAMPLE_BIAS, names.ZCTRL_SETPOINT, names.SCAN_SPEED,
+    names.FEEDBACK_ON, SPRING_CONSTANT, SENSITIVITY,
 )  # fmt: skip
 _SYMBOLS: Final = {names.TIP_BIAS_VOLTAGE: "V", names.SAMPLE_BIAS: "V(sample)", SPRING_CONSTANT: "k"}
 _OF_SETPOINT: Final = {"A": "I", "N": "F", "Hz": "Δf"}
@@ -103,14 +105,26 @@ def as_parameters(settings: Iterable[SettingInForce]) -> tuple[Parameter, ...]:
     return tuple(Parameter(one.name, f"{one.begin:.15g}", one.unit) for one in settings)
 
 
+def bias_of(settings: Iterable[SettingInForce]) -> str:
+    """Return the electrode whose bias the panel shows, "sample" or "tip"; empty if it is not known."""
+    return next((str(one.begin) for one in settings if one.name == BIAS_REFERENCE and one.begin is not None), "")
+
+
 def caption(settings: Sequence[SettingInForce]) -> str:
-    """Return the settings as the caption of a figure: "V = 100 mV, I = 20 pA, 5 nm/s"."""
+    """Return the settings as the caption of a figure: "V = 100 mV, I = 20 pA, 5 nm/s".
+
+    Where the electrode with the bias is known, the bias is "V(sample)" or "V(tip)".
+    """
     feedback = next((one for one in settings if one.name == names.FEEDBACK_ON), None)
+    symbols = {**_SYMBOLS, names.TIP_BIAS_VOLTAGE: f"V({of})"} if (of := bias_of(settings)) else _SYMBOLS
     is_off = feedback is not None and feedback.begin is False
     parts = [
-        f"{symbol} = {one.text}" if (symbol := _symbol(one)) else one.text
+        f"{symbol} = {one.text}" if (symbol := _symbol(one, symbols)) else one.text
         for one in settings
-        if one.text and one is not feedback and not (is_off and one.name == names.ZCTRL_SETPOINT)
+        if one.text
+        and one is not feedback
+        and one.name != BIAS_REFERENCE
+        and not (is_off and one.name == names.ZCTRL_SETPOINT)
     ]
     return ", ".join(parts + (["feedback off"] if is_off else []))
 
@@ -119,12 +133,12 @@ def _rank(name: str) -> tuple[int, str]:
     return (_OF_ANY.index(name) if name in _OF_ANY else len(_OF_ANY), name)
 
 
-def _symbol(one: SettingInForce) -> str:
+def _symbol(one: SettingInForce, symbols: Mapping[str, str]) -> str:
     if one.name == names.SCAN_SPEED:
         return ""
     if one.name == names.ZCTRL_SETPOINT:
         return _OF_SETPOINT.get(one.unit, "setpoint")
-    return _SYMBOLS.get(one.name, one.name.removeprefix("x-").replace("-", " ").replace("lock in", "lock-in"))
+    return symbols.get(one.name, one.name.removeprefix("x-").replace("-", " ").replace("lock in", "lock-in"))
 
 
 def _text(value: Value, unit: str) -> str:

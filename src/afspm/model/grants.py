@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from afspm.basics.errors import InvalidValue
 from afspm.model.geometry import XY, Region
+from afspm.model.parameter_names import BIAS_OF_SAMPLE, TIP_BIAS_VOLTAGE
 
 MOST_STEPS = 1000  # requests in a plan
 MOST_COUNT = 10_000  # times that one action is granted
@@ -92,6 +93,8 @@ class Grant:
         if bool(self.plan) != bool(self.steps):
             raise InvalidValue("an approved plan has an id and steps, a grant has neither")
         for one in self.ranges:
+            if one.parameter == BIAS_OF_SAMPLE:
+                raise InvalidValue(f"a grant for {one.parameter}", hint=f"name {TIP_BIAS_VOLTAGE}, which is the same")
             if not (math.isfinite(one.low) and math.isfinite(one.high) and one.low <= one.high):
                 raise InvalidValue(f"a grant for {one.parameter} from {one.low} to {one.high}")
         for each in self.counts:

@@ -45,6 +45,8 @@ PROBE_POS_Y: Final = "probe-pos-y"
 TIP_BIAS_VOLTAGE: Final = "tip-bias-voltage"
 SAMPLE_BIAS: Final = "x-sample-bias"
 """The second electrode, of a microscope that has both: between tip and sample lies the difference."""
+BIAS_OF_SAMPLE: Final = "sample-bias"
+"""`tip-bias-voltage` with the sign of a bias of the sample: see `model.bias`."""
 
 # The SI unit of each base parameter; None where it depends on the microscope, or on its operating mode.
 BASE_PARAMETERS: Final[dict[str, str | None]] = {
@@ -66,6 +68,9 @@ BASE_PARAMETERS: Final[dict[str, str | None]] = {
     PROBE_POS_Y: "m",
     TIP_BIAS_VOLTAGE: "V",
 }
+
+UNITS_OF_REQUESTS: Final = {**BASE_PARAMETERS, BIAS_OF_SAMPLE: "V"}
+"""The SI units of the base parameters and of their aliases."""
 
 # Pulse and crash are described by parameters, so that the actions stay plain names.
 PULSE_VOLTAGE: Final = "x-pulse-voltage"

@@ -129,12 +129,14 @@ class Request:
             number of a problem or control mode; or the seconds of a lease. None for requests without a subject.
         payload: the subject in bytes, as received.
         id: equal for all repetitions of one request; empty if the request may not be repeated.
+        alias: the parameter's name in the client's request, if the scheduler replaced it; not on the wire.
     """
 
     kind: int
     subject: Any = None
     payload: bytes = b""
     id: str = ""
+    alias: str = ""
 
 
 class ResponseDetail(IntEnum):

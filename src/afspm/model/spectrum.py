@@ -12,7 +12,7 @@ from afspm.basics.entry_points import DISPLAYS, required
 from afspm.basics.errors import InvalidValue
 from afspm.basics.plain_data import Plain
 from afspm.basics.units import in_si
-from afspm.model.caption import SENSITIVITY, SPRING_CONSTANT, SettingInForce, caption
+from afspm.model.caption import SENSITIVITY, SPRING_CONSTANT, SettingInForce, bias_of, caption
 from afspm.model.geometry import XY, Frame
 from afspm.model.variables import (
     BIAS,
@@ -97,6 +97,8 @@ class Spectrum:
     def label(self, name: str) -> str:
         """Return a variable's name for a person, with its role where that differs: "Defl (deflection)"."""
         (role,) = self.roles.roles_of([name])
+        if role.removesuffix(RETRACE) == BIAS and (of := bias_of(self.in_force)):
+            role = f"{of} {role}"
         return f"{name} ({role})" if role and role.casefold() != name.casefold() else name
 
     def of(self, role: str) -> NDArray[np.float64]:

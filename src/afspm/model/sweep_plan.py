@@ -12,7 +12,7 @@ from afspm.basics.argument_checks import FINITE, is_number, plain
 from afspm.basics.errors import InvalidValue, UnitError
 from afspm.basics.units import convert, parse_quantity, require_unit, si_unit
 from afspm.model.instruments import is_of_instrument
-from afspm.model.parameter_names import BASE_PARAMETERS
+from afspm.model.parameter_names import BIAS_OF_SAMPLE, TIP_BIAS_VOLTAGE, UNITS_OF_REQUESTS
 from afspm.model.requests import Parameter
 
 SweptValue = float | str | bool
@@ -107,6 +107,8 @@ class SweepPlan:
     def __post_init__(self) -> None:
         if not self.axes:
             raise InvalidValue("a sweep needs a parameter at least")
+        if {BIAS_OF_SAMPLE, TIP_BIAS_VOLTAGE} <= {axis.name for axis in self.axes}:
+            raise InvalidValue(f"{BIAS_OF_SAMPLE} and {TIP_BIAS_VOLTAGE} are one setting", hint="sweep one of them")
         if self.order not in get_args(SweepOrder):
             raise InvalidValue(f"there is no order {self.order!r}", hint=f"one of {', '.join(get_args(SweepOrder))}")
         if self.repeat < 1:
@@ -176,7 +178,7 @@ class SweepPlan:
 
 def _unit_of(name: str, given: Sequence[SweptValue]) -> str | None:
     # a base parameter has its SI unit, another one the unit of the first quantity with a unit
-    if unit := BASE_PARAMETERS.get(name):
+    if unit := UNITS_OF_REQUESTS.get(name):
         return unit
     for value in given:
         if isinstance(value, str) and (quantity := _quantity(value)) is not None and quantity[1]:
@@ -191,7 +193,7 @@ def _in_unit(name: str, value: SweptValue, unit: str | None) -> SweptValue:
     if isinstance(value, str):
         quantity = _quantity(value)
         if quantity is None:
-            if unit is not None or name in BASE_PARAMETERS:
+            if unit is not None or name in UNITS_OF_REQUESTS:
                 raise InvalidValue(f"{name} can't be {value!r}", hint="a number, with its unit")
             return value
         number, given = quantity
@@ -203,7 +205,7 @@ def _in_unit(name: str, value: SweptValue, unit: str | None) -> SweptValue:
         raise InvalidValue(
             f"{name} can't be set to {number!r}", hint="a finite number, text with a unit, True or False"
         )
-    if unit and not BASE_PARAMETERS.get(name):  # its own unit or the unit of the others? A person knows
+    if unit and not UNITS_OF_REQUESTS.get(name):  # its own unit or the unit of the others? A person knows
         raise UnitError(f"{name}: {value!r} has no unit, others have", hint=f"write it as in '1 {unit}'")
     require_unit(number, unit or "")
     return _finite(name, number)

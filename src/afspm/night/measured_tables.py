@@ -279,7 +279,9 @@ def _changed_by_hand(query: Query) -> list[tuple[int, str]]:
     for time_ns, payload in query("SELECT time_ns, payload FROM packets WHERE message = 'ActByHand'"):
         with suppress(WireError):
             acts.append((time_ns, wire.decode("ActByHand", payload)))
-    return [(time_ns, change.parameter) for time_ns, act in acts for change in act.changes]
+    changed = [(time_ns, change.parameter) for time_ns, act in acts for change in act.changes]
+    of_bias = (names.TIP_BIAS_VOLTAGE, names.SAMPLE_BIAS)
+    return changed + [(time_ns, names.BIAS_OF_SAMPLE) for time_ns, name in changed if name in of_bias]
 
 
 def _with_instruments(

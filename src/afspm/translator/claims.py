@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from afspm.basics.errors import InvalidValue, Refused
 from afspm.model import ActByHand, MeasurementConditions, Parameter, Request, ScopeState, TipStatus, names
-from afspm.model.caption import captioned
+from afspm.model.caption import BIAS_REFERENCE, captioned
 from afspm.translator.driver_base import DriverBase
 from afspm.translator.judge import Claim, ResultVerdict, Stated, Witness, judge
 from afspm.translator.parameters import FEEDBACK_ON, Value
@@ -153,9 +153,13 @@ class Claims:
             self._parameters({name: claim.begin.get(name, value) for name, value in claim.values.items()}),
             self._parameters(self._end),
             tuple(unproved),
-            self._parameters({name: value for name, value in claim.in_force.items() if value is not None}),
-            self._parameters(self._end_in_force),
+            self._in_force({name: value for name, value in claim.in_force.items() if value is not None}),
+            self._in_force(self._end_in_force),
         )
+
+    def _in_force(self, values: Mapping[str, Value]) -> tuple[Parameter, ...]:
+        shown, of = self._parameters(values), self._driver.bias.of
+        return (*shown, Parameter(BIAS_REFERENCE, of)) if of and names.TIP_BIAS_VOLTAGE in values else shown
 
     def _of_caption(self, *, of_scan: bool) -> list[str]:
         return captioned(self._driver.table, of_scan=of_scan)

@@ -10,13 +10,14 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
 from afspm.basics.clock import Clock
 from afspm.basics.errors import AfspmError, ConfigError, ErrorCollector, InvalidValue, Refused
 from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.basics.units import Duration, PollPeriod
 from afspm.model import ChannelRoles, ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.model.bias import BiasOf, BiasReference
 from afspm.model.state import MEASURING
 from afspm.model.variables import VariableRoles
 from afspm.translator.judge import WITNESSES, Stated
@@ -192,6 +193,8 @@ class DriverBase(ABC):
             at least twice `program_s` of real time.
         live_lines_s: time between two publications of a running scan's lines, in experiment seconds; 0: never; None: by
             `live_real_s`.
+        bias_reference: the electrode whose bias is the number at the panel (`tip-bias-voltage`), where that depends on
+            the wiring: "sample" or "tip". With it there is the parameter `sample-bias`.
         settle_before_scan_s: wait after a request that moves the frame, in experiment seconds: the microscope counts as
             moving until the scanner has settled, so that no scan begins.
         trace: record all exchanges with the controller in `controller.trace.jsonl` of the run's folder.
@@ -212,6 +215,7 @@ class DriverBase(ABC):
         lacking: actions that this controller turned out not to have, with the reason; set it when connecting.
         memory: a dict of JSON values, saved with every executed request and every result, and restored after a restart.
         channels: the channels that the microscope may have, by their roles.
+        bias: the reference of the bias.
         common: the settings above except `parameters` and `channels`, as given.
     """
 
@@ -222,6 +226,9 @@ class DriverBase(ABC):
     """The maker's names of channels by role, as in `Scan.channel`; under "other" those without a role."""
     variable_roles: ClassVar[VariableRoles | None] = None
     """The maker's names of the variables of curves by role; None: found by names that makers are known to use."""
+    bias_reference: ClassVar[BiasOf] = ""
+    """The electrode whose bias is the number at the maker's panel, if the maker says so; empty if it does not, or if
+    that depends on the wiring."""
     translated: ClassVar[Collection[str]] = ()
     """The parameters that `read` and `write` of the class translate, rather than `get` and `set` by a row."""
     eager_poll_s: ClassVar[float] = EAGER_S
@@ -293,6 +300,7 @@ class DriverBase(ABC):
         live_lines_s: Duration | None = None,
         trace: bool = False,
         settle_before_scan_s: Duration = 0.0,
+        bias_reference: Literal["sample", "tip"] | None = None,
     ) -> None:
         if live_lines_s is not None and type(self).lines is DriverBase.lines:
             raise ConfigError(f"{type(self).__name__} does not publish lines of a running scan", where="live_lines_s")
@@ -300,6 +308,7 @@ class DriverBase(ABC):
         # a microscope that can't move its tip alone has no rows for it later on, and the same scanner
         self._reach = reach_in(self.table)
         self.channels = self.channels_of({"channels": channels})
+        self.bias = self.bias_of({"bias_reference": bias_reference}, self.table)
         self.common = CommonSettings(
             dict(actions or {}), poll_period_s, result_timeout_s, live_lines_s, trace, settle_before_scan_s
         )
@@ -402,6 +411,20 @@ class DriverBase(ABC):
             ConfigError: the file names a role that there is not.
         """
         return cls.declared_channels(settings).changed(settings.get("channels") or {})
+
+    @classmethod
+    def bias_of(cls, settings: PlainMapping, table: ParameterTable) -> BiasReference:
+        """Return the reference of the bias, by the maker or else by the settings.
+
+        Raises:
+            ConfigError: they differ.
+        """
+        given: BiasOf = settings.get("bias_reference") or ""
+        declared = cls.bias_reference
+        if given and declared and given != declared:
+            what = f"the panel of {cls.software or cls.__name__} has the bias of the {declared}, not of the {given}"
+            raise ConfigError(what, where="bias_reference", hint="leave it out")
+        return BiasReference(declared or given, names.SAMPLE_BIAS in table)
 
     @classmethod
     def introductions(cls) -> Callable[[str], Introduction] | None:

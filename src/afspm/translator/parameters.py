@@ -259,6 +259,10 @@ class ParameterTable(Mapping[str, ParameterSpec]):
         table = dict(self._rows)
         errors = ErrorCollector()
         for name, given in rows.items():
+            if name == names.BIAS_OF_SAMPLE:
+                what = f"{name} is another name of {names.TIP_BIAS_VOLTAGE}, and has no row of its own"
+                errors.add(ConfigError(what, where=f"{where}, parameters.{name}", hint="give it a name with x-"))
+                continue
             known = table.get(name, ParameterSpec(name, vendor=name, unit=names.BASE_PARAMETERS.get(name) or ""))
             with errors:
                 table[name] = _row(known, given, where, translated=name in translated)
@@ -279,6 +283,9 @@ class ParameterTable(Mapping[str, ParameterSpec]):
         Raises:
             Refused: PARAM_NOT_SUPPORTED, with the nearest name.
         """
+        if name == names.BIAS_OF_SAMPLE:
+            reason = f"{name} is a name for requests, [limits] and sweeps: name {names.TIP_BIAS_VOLTAGE} here"
+            raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, reason)
         if name not in self._rows:
             # the name comes from a peer, and may be of any length
             near = difflib.get_close_matches(name[:100], self._rows, n=1)

@@ -220,6 +220,19 @@ def test_value_that_a_person_changed_meanwhile_is_in_no_column(
     assert [[one.name for one in row.settings] for row in rows] == [["scan-speed"], ["zctrl-igain", "scan-speed"]]
 
 
+@pytest.mark.parametrize("changed", ["tip-bias-voltage", "x-sample-bias"])
+def test_swept_bias_of_the_sample_is_in_no_column_after_a_change_at_either_electrode(
+    night: Night, store: RecordStore, tmp_path: Path, changed: str
+) -> None:
+    swept = MeasurementSettings(night.now_ns, "series", (Parameter("sample-bias", "1", "V"),), "sweep-1")
+    act = ActByHand(night.now_ns + 1, PanelAct.VALUES, changes=(ChangedValue(changed, "0", "1", "V"),))
+    store.take([night.control(), night.packet(swept), start(night, "sweep-1"), night.state(ScopeState.SCANNING)])
+    store.take([night.lines(), night.packet(act), night.state(ScopeState.INTERRUPTED)])
+    store.take([night.packet(swept), start(night, "sweep-1"), *night.whole_scan(2)])
+    rows = afspm.open_run(tmp_path).scans
+    assert [[one.name for one in row.settings] for row in rows] == [[], ["sample-bias"]]
+
+
 def test_swept_parameters_are_columns_of_the_spectra(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take([night.control(), settings(night, "5"), night.state(ScopeState.SPEC), night.spectrum()])
     spectra = afspm.open_run(tmp_path).spectra

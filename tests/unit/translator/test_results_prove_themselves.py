@@ -81,6 +81,22 @@ def test_a_result_has_the_settings_of_its_caption_at_both_ends(bench: Any, scan:
     assert names.SCAN_SPEED in {one.name for one in found.in_force}
 
 
+@pytest.mark.parametrize("of", ["sample", "tip", None])
+def test_a_result_has_the_reference_of_its_bias_where_it_is_known(make_bench: Any, scan: Any, of: str | None) -> None:
+    bench = make_bench({"bias_reference": of})
+    assert scan_it(bench, scan, "1")[-2:] == ["Scan2d", "FREE"]
+    (found,) = [one for one in bench.beside if isinstance(one, MeasurementConditions)]
+    assert [one.columns for one in found.in_force if one.name == "bias-reference"] == (
+        [{"bias-reference": of}] if of else []
+    )
+
+
+def test_alias_never_reaches_a_controller_without_its_scheduler(bench: Any) -> None:
+    for value in ("1", None):
+        answer = bench.ask(PARAM, Parameter("sample-bias", value, "V"))
+        assert (answer.code, "name tip-bias-voltage here" in answer.reason) == (8, True)
+
+
 def test_a_setting_that_cannot_be_read_costs_its_caption_alone(make_bench: Any, scan: Any) -> None:
     bench = make_bench({"parameters": {"x-sensitivity": {"vendor": "Lock", "unit": "m/V"}}})
     bench.microscope.values["Lock"] = 1e-7

@@ -221,6 +221,9 @@ def _set_step(given: Mapping[str, object], where: str) -> SetStep:
     is_name = isinstance(name, str) and name.replace("-", "").replace(".", "").replace("_", "").isalnum()
     if not isinstance(name, str) or not is_name or len(name) > 100:
         raise InvalidValue("a parameter has a name", where=f"{where}.parameter")
+    if name == names.BIAS_OF_SAMPLE:  # the scheduler would take the request for another than the approved one
+        hint = f"name {names.TIP_BIAS_VOLTAGE}, with the sign at the panel"
+        raise InvalidValue(f"a plan can't set {name}", where=f"{where}.parameter", hint=hint)
     if not isinstance(value, str) or not 0 < len(value) <= 100 or not value.isprintable():
         raise InvalidValue("a value is text: a quantity with its unit, or a word", where=f"{where}.value")
     if value[:1] in "+-.0123456789":

@@ -110,6 +110,7 @@ class Asylum(ScriptedDriver[Session, AsylumActivity]):
     maker: ClassVar[str] = "Oxford Instruments Asylum Research"
     software: ClassVar[str] = "Asylum Research in Igor Pro"
     counts_clockwise: ClassVar[bool] = True
+    bias_reference = "tip"  # (! tip-voltage)
     program: ClassVar[str] = "Igor"
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0

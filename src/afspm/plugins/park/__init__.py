@@ -73,6 +73,7 @@ class Park(ScriptedDriver[Session, SmartScanActivity]):
     translated = (*FrameSettings.names, *Gains.names, *POSITION, *_AT_FIRST, names.CONTROLLER)
     channel_roles = _CHANNELS
     variable_roles = _VARIABLES
+    bias_reference = "tip"  # (! tip-bias)
     maker: ClassVar[str] = "Park Systems"
     software: ClassVar[str] = "SmartScan"
     program: ClassVar[str] = SmartScanActivity.program

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import json
 
+from afspm.basics.errors import InvalidValue
 from afspm.basics.frozen import replace
 from afspm.model import (
     CLOCK_REQUEST,
@@ -91,8 +92,26 @@ def handle(draft: StateDraft, event: RequestIn) -> None:
     """Run the stages of a request that are decided at its arrival."""
     if event.heard_s < 0.0:
         event = replace(event, heard_s=draft.now_s)
-    if admit(draft, event) and authorise(draft, event):
+    event, why = _by_canonical_name(draft, event)
+    if not admit(draft, event):
+        return
+    if why:
+        answers.answer(draft, event, ControlResponse.PARAM_ERROR, why)
+    elif authorise(draft, event):
         enqueue(draft, event)
+
+
+def _by_canonical_name(draft: StateDraft, event: RequestIn) -> tuple[RequestIn, str]:
+    # before all stages, so that no limit, rule or approval is passed under another name; also why it can't be
+    asked = event.request.subject
+    if not isinstance(asked, Parameter) or asked.name != names.BIAS_OF_SAMPLE:
+        return event, ""
+    try:
+        subject = draft.env.settings.limits.bias.canonical(asked)
+    except InvalidValue as error:
+        return event, error.what
+    payload = draft.env.codec.encode(subject)
+    return replace(event, request=replace(event.request, subject=subject, payload=payload, alias=asked.name)), ""
 
 
 # --- 1. admitted: the name belongs to the peer, and the request is new -----------------------------------------------
@@ -277,7 +296,8 @@ def enqueue(draft: StateDraft, event: RequestIn) -> None:
         answers.answer(draft, event, ControlResponse.NOT_FREE, why)
         return
     is_repeated = draft.idempotency.look_up(name, request) is RequestStatus.UNKNOWN
-    job = ForwardedRequest.of(event, command=is_command, is_repeated=is_repeated)
+    takes_turn = is_command or _needs_second_electrode(draft, request)
+    job = ForwardedRequest.of(event, command=takes_turn, is_repeated=is_repeated)
     if instrument_requests.is_for_instrument(draft, event):
         instrument_requests.ask(draft, event, job, _not_allowed_now)
         return
@@ -337,10 +357,13 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
     if turn.awaited is None and _starts_reads(draft, job, turn):
         return
     _apply_read_values(draft, turn)
+    if (refusal := _refusal_for_second_electrode(job, turn)) is not None:
+        _refuse(draft, job, refusal)
+        return
     mapped = _mapped(draft, job)
     if isinstance(mapped, Response) or not _is_within_limits(draft, job, mapped, turn):
         return
-    if (refusal := approvals.refusal(draft, job)) is not None:
+    if not reads(job.request) and (refusal := approvals.refusal(draft, job)) is not None:
         _refuse(draft, job, refusal)
         return
     if job.request.kind == _ACTION:
@@ -362,10 +385,11 @@ def _send(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None
     job = job._replace(mapped=mapped, states_seen=draft.microscope.states_seen, sent_ns=sent_ns)
     draft.event_log = draft.event_log.sending(name, request, sent_ns)
     if job.command:
+        draft.pending = replace(draft.pending, turn=None)
+    if job.command and not reads(request):
         draft.limits = draft.limits.sending(name, job.outgoing, draft.now_ns, _names_meant(job))
         present_state.sending(draft, job.outgoing)
         approvals.sending(draft, job)
-        draft.pending = replace(draft.pending, turn=None)
         _restart_lease(draft, name)
     draft.forwarder = draft.forwarder.sent(job, draft.now_s)
     if not request.id:
@@ -380,6 +404,9 @@ def _send(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None
 
 
 def _refuse(draft: StateDraft, job: ForwardedRequest, refusal: Response) -> None:
+    if alias := job.request.alias:
+        sign = "-" if draft.env.settings.limits.bias.sign < 0 else ""
+        refusal = replace(refusal, reason=f"{refusal.reason}; here {alias} is {sign}{job.request.subject.name}")
     answers.log_refusal(draft, job.client, refusal)
     _answer_unsent(draft, job, refusal)
 
@@ -404,7 +431,7 @@ def _not_allowed_now(draft: StateDraft, job: ForwardedRequest) -> Response | Non
     if ControlChange.FORWARD not in row.do:
         code = ControlResponse.NOT_IN_CONTROL if row.response is None else row.response
         return Response(int(code), b"", reason(row, draft.control, ask, rules), job.request.id)
-    if (why := _refusal_for_tip(draft)) is not None:
+    if not reads(job.request) and (why := _refusal_for_tip(draft)) is not None:
         return Response(int(ControlResponse.NOT_FREE), b"", why, job.request.id)
     return None
 
@@ -412,7 +439,7 @@ def _not_allowed_now(draft: StateDraft, job: ForwardedRequest) -> Response | Non
 def _knows_no_danger(draft: StateDraft, job: ForwardedRequest) -> bool:
     # the holder was restarted, and commands with the feedback off as its earlier life left it (decision 0001); one that
     # sets the feedback or retracts knows of it
-    if job.client != draft.control.holder or not draft.microscope.endangered_by_feedback:
+    if job.client != draft.control.holder or not draft.microscope.endangered_by_feedback or reads(job.request):
         return False
     retracts = job.request.kind == _ACTION and job.request.subject == draft.watchdog.settings.retract
     feedback = feedback_of(job.request)
@@ -463,13 +490,34 @@ def _is_within_limits(draft: StateDraft, job: ForwardedRequest, mapped: MappedRe
 
 def _starts_reads(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
     needed = draft.limits.depends_on(job.request, is_mapped=draft.frame.maps(draft.now_ns))
-    needed = list(dict.fromkeys((*needed, *draft.grants.depends_on(job.client, job.request))))
+    second = [names.SAMPLE_BIAS] if _needs_second_electrode(draft, job.request) else []
+    needed = list(dict.fromkeys((*needed, *draft.grants.depends_on(job.client, job.request), *second)))
     if not needed:
         return False
     draft.pending = replace(draft.pending, turn=turn.reading(frozenset(needed)))
     for name in needed:
         _read(draft, name, ReadForTurn(job.number, name))
     return True
+
+
+def _needs_second_electrode(draft: StateDraft, request: Request) -> bool:
+    return bool(request.alias) and draft.env.settings.limits.bias.may_have_second
+
+
+def _refusal_for_second_electrode(job: ForwardedRequest, turn: Turn) -> Response | None:
+    if not job.request.alias or names.SAMPLE_BIAS not in turn.values:  # a microscope without it does not answer
+        return None
+    volts = "no value" if (found := turn.values[names.SAMPLE_BIAS]) is None else f"{found.value} {found.unit or 'V'}"
+    try:
+        if found is not None and float(found.value or "nan") == 0.0:
+            return None
+    except ValueError:
+        pass
+    why = (
+        f"{job.request.alias} is the whole voltage only while the second electrode is at 0 V, and "
+        f"{names.SAMPLE_BIAS} reads {volts}: set it to 0 V, or set {names.TIP_BIAS_VOLTAGE}"
+    )
+    return Response(int(ControlResponse.PARAM_ERROR), b"", why, job.request.id)
 
 
 def _take_read_value(draft: StateDraft, number: int, name: str, response: Response) -> None:
@@ -556,6 +604,7 @@ def settle(draft: StateDraft, settled: SettledRequest) -> None:
         if response.ok and (job.command or job.request.kind == _PARAM):
             response = _apply_success(draft, job, response)
             _look_at_value(draft, job, response)
+            response = _as_asked(draft, job, response)
     # it may have been carried out: its values are read before the next request that depends on them
     if job.command and end is not ForwardOutcome.NOT_SENT and _is_unknown(response):
         draft.limits = draft.limits.unknown(job.outgoing)
@@ -576,6 +625,17 @@ def settle(draft: StateDraft, settled: SettledRequest) -> None:
             _action_started(draft, job, is_certain=False)
         _track_feedback(draft, job, response)
         answers.finish(draft, job, response, _unknown_status(response))
+
+
+def _as_asked(draft: StateDraft, job: ForwardedRequest, response: Response) -> Response:
+    codec, bias = draft.env.codec, draft.env.settings.limits.bias
+    answered = codec.decode_parameter(response.payload) if job.request.alias and response.payload else None
+    if answered is None:
+        return response
+    try:
+        return replace(response, payload=codec.encode(bias.of_sample(answered)))
+    except InvalidValue as error:
+        return replace(response, code=int(ControlResponse.PARAM_ERROR), payload=b"", reason=error.what)
 
 
 def _look_at_value(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:

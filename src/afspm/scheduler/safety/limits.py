@@ -9,7 +9,8 @@ from functools import cache, cached_property
 from typing import Annotated, Any, ClassVar, get_type_hints
 
 from afspm.basics.units import PositiveDuration
-from afspm.model import Parameter, Region
+from afspm.model import Parameter, Region, names
+from afspm.model.bias import BiasReference
 from afspm.scheduler.safety import rule_language
 from afspm.scheduler.safety.rule_language import RuleTree
 
@@ -91,6 +92,24 @@ class Limit:
         """Whether the parameter must be a number."""
         return self.bounds_changes or self.has_range
 
+    def times(self, sign: float) -> Limit:
+        """Return the limit of the quantity times 1 or -1."""
+        if sign > 0:
+            return self
+        low, high = (None if end is None else 0.0 - end for end in (self.high, self.low))
+        return replace(self, low=low, high=high)
+
+    def narrowed(self, other: Limit) -> Limit:
+        """Return the limit that holds if both hold, in the same unit."""
+        found: dict[str, Any] = {}
+        for name, bound in bounds(Limit).items():
+            mine, theirs = getattr(self, name), getattr(other, name)
+            found[name] = theirs if mine is None or (theirs is not None and bound.is_within(theirs, mine)) else mine
+        if self.only is not None and other.only is not None:
+            found["only"] = tuple(who for who in self.only if who in other.only)
+        source = ", ".join(dict.fromkeys((self.source, other.source)))
+        return replace(self, **found, unseen_sweeps=self.unseen_sweeps and other.unseen_sweeps, source=source)
+
 
 @dataclass(frozen=True)
 class ForbiddenState:
@@ -100,15 +119,18 @@ class ForbiddenState:
         rule: the rule in the language of `rule_language`.
         units: the SI unit of each quantity in the rule, by name; switches and states have none.
         source: the place in the experiment file.
+        bias_sign: the factor of `tip-bias-voltage` in place of `sample-bias`.
     """
 
     rule: str
     units: Mapping[str, str] = field(default_factory=dict)
     source: str = "[limits] forbid"
+    bias_sign: float = 1.0
 
     @cached_property
     def tree(self) -> RuleTree:
-        return rule_language.parse(self.rule)
+        tree = rule_language.parse(self.rule)
+        return rule_language.renamed(tree, names.BIAS_OF_SAMPLE, names.TIP_BIAS_VOLTAGE, self.bias_sign)
 
     @cached_property
     def names(self) -> frozenset[str]:
@@ -152,6 +174,7 @@ class ExperimentLimits:
         sets: for each action by name, the parameters that the microscope sets as that action.
         roles: further limits by name of a component, or of a person or agent: "agent", "agent:claude".
         forbid: the forbidden states, by name.
+        bias: the reference of the bias, which decides the sign of `sample-bias`. No limit here has that name.
     """
 
     parameters: Mapping[str, Limit] = field(default_factory=dict)
@@ -163,6 +186,7 @@ class ExperimentLimits:
     sets: Mapping[str, tuple[Parameter, ...]] = field(default_factory=dict)
     roles: Mapping[str, RoleLimits] = field(default_factory=dict)
     forbid: Mapping[str, ForbiddenState] = field(default_factory=dict)
+    bias: BiasReference = field(default_factory=BiasReference)
 
     @cached_property
     def fixed(self) -> ExperimentLimits:

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from afspm.basics.errors import AfspmError
@@ -60,6 +60,7 @@ class RuleTerm:
         absolute: whether the amount of the quantity counts.
         minus: the name of a quantity that is subtracted before; empty without one.
         at: the place in the rule.
+        name_sign, minus_sign: factors of both quantities: -1 for an alias that counts the other way.
     """
 
     name: str = ""
@@ -68,6 +69,8 @@ class RuleTerm:
     absolute: bool = False
     minus: str = ""
     at: int = 0
+    name_sign: float = 1.0
+    minus_sign: float = 1.0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -79,10 +82,21 @@ class RuleTerm:
         value, less = known.get(self.name), known.get(self.minus) if self.minus else 0.0
         if value is None or less is None:
             return None
-        return abs(value - less) if self.absolute else float(value)
+        if self.absolute:
+            return abs(self.name_sign * value - self.minus_sign * less)
+        return self.name_sign * float(value)
+
+    def renamed(self, old: str, new: str, sign: float) -> RuleTerm:
+        """Return the term with `sign` times the quantity `new` in place of the quantity `old`."""
+        term = replace(self, name=new, name_sign=sign) if self.name == old else self
+        return replace(term, minus=new, minus_sign=sign) if term.minus == old else term
 
     def __str__(self) -> str:
-        return f"abs({' - '.join(self.names)})" if self.absolute else self.name or quantity(self.number, self.unit, 6)
+        if not self.name:
+            return quantity(self.number, self.unit, 6)
+        signs = (self.name_sign, self.minus_sign)
+        shown = [f"{'-' if sign < 0 else ''}{name}" for name, sign in zip(self.names, signs, strict=False)]
+        return f"abs({' - '.join(shown)})" if self.absolute else shown[0]
 
 
 @dataclass(frozen=True)
@@ -163,6 +177,16 @@ def atoms(tree: RuleTree) -> Iterator[RuleAtom]:
             yield from atoms(part)
     else:
         yield tree
+
+
+def renamed(tree: RuleTree, old: str, new: str, sign: float) -> RuleTree:
+    """Return a rule with `sign` times the quantity `new` in place of the quantity `old`."""
+    match tree:
+        case RuleJunction():
+            return replace(tree, parts=tuple(renamed(part, old, new, sign) for part in tree.parts))
+        case RuleSwitch():
+            return replace(tree, name=new) if tree.name == old else tree
+    return replace(tree, left=tree.left.renamed(old, new, sign), right=tree.right.renamed(old, new, sign))
 
 
 def holds(tree: RuleTree, known: Known, false: Collection[RuleAtom] = ()) -> bool | None:

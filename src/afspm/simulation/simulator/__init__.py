@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Final, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Final, Literal, TypeVar
 
 from afspm.basics.errors import AfspmError, ConfigError, ErrorCollector, Refused
 from afspm.basics.plain_data import PlainMapping
@@ -128,11 +128,13 @@ class Simulator(Driver):
         result_timeout_s: longest delay of the file after the end of a scan or spectrum.
         live_lines_s: interval between publications of lines of a running scan; 0: never; by default 0.5 real seconds.
         settle_before_scan_s: wait after a move of the frame, before a scan can begin.
+        bias_reference: "sample" alone, which the simulated microscope has, so that a maker's file can be rehearsed.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
     maker: ClassVar[str] = "afspm"
     software: ClassVar[str] = "afspm, simulated microscope"
+    bias_reference = "sample"
     max_pixels: ClassVar[int] = 2048 * 2048
     simulated: ClassVar[bool] = True
     live_real_s: ClassVar[float | None] = 0.5
@@ -173,6 +175,7 @@ class Simulator(Driver):
         result_timeout_s: Duration = 10.0,
         live_lines_s: Duration | None = None,
         settle_before_scan_s: Duration = 0.0,
+        bias_reference: Literal["sample", "tip"] | None = None,
     ) -> None:
         world: Table = {
             "surface": surface,
@@ -213,6 +216,7 @@ class Simulator(Driver):
                 result_timeout_s=result_timeout_s,
                 live_lines_s=live_lines_s,
                 settle_before_scan_s=settle_before_scan_s,
+                bias_reference=bias_reference,
             )
             self.channels = self.channels_of({**self._world_settings, "channels": channels})
             if not fault_action:
