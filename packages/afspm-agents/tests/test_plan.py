@@ -68,6 +68,7 @@ def test_canonical_form_with_an_added_field_is_refused() -> None:
     [
         {**SCAN, "center": ["10", "0 nm"]},
         {**SCAN, "center": [1e-8, 0.0]},
+        {"do": "set", "parameter": "sample-bias", "value": "500 mV"},
         {**SCAN, "center": ["nan nm", "0 nm"]},
         {**SCAN, "center": ["inf nm", "0 nm"]},
         {**SCAN, "center": ["10 V", "0 nm"]},

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from afspm.basics.errors import InvalidValue
+from afspm.client.parameter_text import from_parameter, to_parameter
 from afspm.model import Grant, GrantedRange, Parameter, Spectrum
 from afspm.model.bias import BiasOf, BiasReference
 from afspm.model.caption import BIAS_REFERENCE, SettingInForce, bias_of, caption
@@ -39,6 +40,12 @@ def test_unknown_reference_is_refused_with_the_remedy_and_other_parameters_pass(
     with pytest.raises(InvalidValue, match='bias_reference = "sample" or "tip"'):
         BiasReference().canonical(Parameter("sample-bias", "1"))
     assert BiasReference("tip").canonical(Parameter("x-sample-bias", "1")) == Parameter("x-sample-bias", "1")
+
+
+def test_value_without_a_unit_counts_in_v_for_both_names() -> None:
+    for name in ("sample-bias", "tip-bias-voltage"):
+        assert to_parameter(name, 0.1, None).unit == "V"
+        assert from_parameter(Parameter(name, "100", "mV"), None) == pytest.approx(0.1)
 
 
 def test_sweep_names_one_of_both() -> None:

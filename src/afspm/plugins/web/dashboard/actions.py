@@ -198,7 +198,7 @@ def _in_force(parameter: str, response: Response) -> str:
         return "unknown"
     parameter_now = wire.decode_parameter(response.payload)
     value = from_parameter(parameter_now, None)
-    unit = names.BASE_PARAMETERS.get(parameter) or parameter_now.unit or ""
+    unit = names.UNITS_OF_REQUESTS.get(parameter) or parameter_now.unit or ""
     if isinstance(value, bool) or not isinstance(value, float | int):
         return str(value)
     return f"{math.degrees(value):.6g} deg" if unit == "rad" else quantity(value, unit, 6)
@@ -212,7 +212,7 @@ def unclear(parameter: str, text: str, shown: str) -> str:
     >>> unclear("scan-speed", "8", "4 µm/s")
     'scan-speed: write the unit as well, for example "8 µm/s".'
     """
-    unit = _unit_of(shown) or names.BASE_PARAMETERS.get(parameter)
+    unit = _unit_of(shown) or names.UNITS_OF_REQUESTS.get(parameter)
     if not text.strip():
         return f"{parameter}: write a value."
     try:

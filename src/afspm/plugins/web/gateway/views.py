@@ -100,14 +100,14 @@ def spectrum_model(spectrum: SpectrumSummary) -> SpectrumModel:
 def parameter_model(name: str, response: Response, asked: float | str | bool | None = None) -> ParameterModel:
     """Return the parameter in a response; without a payload, the requested value."""
     if not response.payload:
-        return ParameterModel(name=name, value=asked, unit=names.BASE_PARAMETERS.get(name) or "")
+        return ParameterModel(name=name, value=asked, unit=names.UNITS_OF_REQUESTS.get(name) or "")
     said = wire.decode_parameter(response.payload)
     value = from_parameter(said, None)
     is_number = isinstance(value, float) and not isinstance(value, bool)
     return ParameterModel(
         name=name,
         value=number_or_none(value) if is_number and isinstance(value, float) else value,
-        unit=names.BASE_PARAMETERS.get(name) or said.unit or "",
+        unit=names.UNITS_OF_REQUESTS.get(name) or said.unit or "",
     )
 
 
