@@ -14,7 +14,7 @@ from afspm.components.pace import Pace
 from afspm.components.planned_scans import pair
 from afspm.components.scan_plan import XY, RefusedPlaces, grid_centers
 from afspm.model import names
-from afspm.model.curve_request import CurveTable, curve_parameters
+from afspm.model.curve_request import CurveTable, curve_parameters, time_of_curves
 from afspm.model.planned_work import PlannedWork
 
 MOST_LINES = 20
@@ -89,8 +89,8 @@ class SpectroscopyGrid(Component):
         self.end_when_done = end_when_done
 
     def planned_work(self, speed_m_s: float | None) -> PlannedWork:
-        spectra, why = len(self.positions) * self.repeats, "the controller sets the duration of a spectrum"
-        return PlannedWork(spectra=spectra, ends_experiment=self.end_when_done, why=why)
+        spectra = len(self.positions) * self.repeats
+        return PlannedWork(spectra=spectra, ends_experiment=self.end_when_done, why=time_of_curves(self.curve, spectra))
 
     def run(self) -> None:
         kept = self.scope.control() if self.keep_control else nullcontext()

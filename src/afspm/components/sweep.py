@@ -19,7 +19,7 @@ from afspm.components.pace import Pace
 from afspm.components.planned_scans import FRAME, ListedRegion, Pixels, pair, shape_of
 from afspm.components.scan_plan import XY, ScanPlan, grid_centers
 from afspm.model import Parameter, Region, names
-from afspm.model.curve_request import CurveTable, curve_parameters
+from afspm.model.curve_request import CurveTable, curve_parameters, time_of_curves
 from afspm.model.instruments import is_of_instrument
 from afspm.model.planned_work import PlannedWork, planned_rounds
 from afspm.model.snapshot import to_plain
@@ -177,7 +177,7 @@ class Sweep(Component):
     def planned_work(self, speed_m_s: float | None) -> PlannedWork:
         total, ends = self.sweep.total, self.end_when_done
         spectra = 0 if self.measure == "scan" else total * max(len(self.positions), 1)
-        why = "the controller sets the duration of a spectrum"
+        why = time_of_curves(self.curve, spectra)
         if self.measure == "spectrum":
             return PlannedWork(spectra=spectra, ends_experiment=ends, why=why)
         if not self.regions or self._shape is None:

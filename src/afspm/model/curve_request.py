@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Final
 
 from afspm.basics.errors import InvalidValue, UnitError
+from afspm.basics.formatting import duration_text
 from afspm.basics.units import parse_quantity, si
 from afspm.model import parameter_names as names
 from afspm.model.requests import Parameter
@@ -65,6 +66,15 @@ def curve_parameters(given: CurveSettings, kind: str | None = None, where: str =
         if one.name in unfit:
             raise InvalidValue(f"a curve {kind} sweeps the {swept}, and has no {one.name}", where=where)
     return tuple(made)
+
+
+def time_of_curves(given: CurveSettings, count: int) -> str:
+    """Return how long a number of curves takes as far as a request says, in words, for `PlannedWork.why`."""
+    known = {one.name: one.value for one in curve_parameters(given)}
+    points, point_time_s = known.get(names.SPEC_POINTS), known.get(names.SPEC_POINT_TIME)
+    if not points or not point_time_s:
+        return "the controller sets the duration of a spectrum"
+    return f"the points of the curves take {duration_text(count * int(points) * float(point_time_s))}"
 
 
 def _known(given: Mapping[str, object], known: Collection[str], where: str) -> None:

@@ -139,3 +139,15 @@ def test_sweep_plans_each_of_its_speeds_and_names_unknown_parts() -> None:
     assert (cold.scans, cold.end_s) == (2, None)
     assert "cryo.temperature" in cold.why
     assert Sweep(swept, measure="spectrum").planned_work(None).spectra == 6
+
+
+@pytest.mark.parametrize(
+    ("curve", "why"),
+    [
+        ({"points": 201, "point_time": "50 ms"}, "the points of the curves take 1 min 30 s"),
+        ({"points": 201}, "the controller sets the duration of a spectrum"),
+    ],
+)
+def test_time_of_curves_is_known_from_points_and_the_time_of_each(curve: dict[str, Any], why: str) -> None:
+    work = SpectroscopyGrid(counts=(3, 3), spacing=(1e-8, 1e-8), curve=curve).planned_work(None)
+    assert (work.spectra, work.why) == (9, why)
