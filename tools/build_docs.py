@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -40,40 +40,52 @@ SEARCHES = (
     "gwyddion",
 )
 """What people look for: a build fails if the search of the site finds nothing for one of them."""
+PAGES = (
+    "*.md",
+    "changes/README.md",
+    "docs/**/*.md",
+    "experiments/**/*.md",
+    "src/**/README.md",
+    "clients/*/README.md",
+    "packages/*/README.md",
+    "packages/*/docs/*.md",
+)
 FENCES = {".py": "python", ".toml": "toml", ".proto": "protobuf", ".json": "json", ".md": "markdown"}
 
 
 def main() -> None:
     for folder in (SOURCE, SITE):
         shutil.rmtree(folder, ignore_errors=True)
-    pages = [
-        *ROOT.glob("*.md"),
-        ROOT / "changes" / "README.md",
-        *(ROOT / "docs").rglob("*.md"),
-        *(ROOT / "experiments").rglob("*.md"),
-    ]
-    for page in [
-        *pages,
-        *(ROOT / "src").rglob("README.md"),
-        *(ROOT / "clients").glob("*/README.md"),
-        *(ROOT / "packages").glob("*/README.md"),
-        *(ROOT / "packages").glob("*/docs/*.md"),
-    ]:
-        _write(page.relative_to(ROOT).as_posix(), _for_site(page))
-    shutil.copytree(ROOT / "docs" / "pictures", SOURCE / "docs" / "pictures")
-    for drawing in (SOURCE / "docs" / "pictures").glob("*.svg"):
-        _two_drawings(drawing)
-    config = (ROOT / "zensical.toml").read_text(encoding="utf-8")
-    config = config.replace("[project]\n", f"[project]\nnav = {_nav()}\n{_about()}", 1)
-    (BUILD / "zensical.toml").write_text(config, encoding="utf-8")
+    prepare(ROOT, SOURCE, BUILD / "zensical.toml")
     _zensical()
     broken = sorted(set(_broken_links()))
     if broken:
         sys.exit("\n".join([*broken, f"{len(broken)} broken links"]))
     index = json.loads((SITE / "search.json").read_text(encoding="utf-8"))["items"]
-    if missed := [words for words in SEARCHES if not _finds(index, words)]:
+    if missed := unfound(index, SEARCHES):
         sys.exit(f"the search finds nothing for: {', '.join(missed)}")
     sys.stdout.write(f"{SITE / 'index.html'}: every link leads somewhere\n")
+
+
+def prepare(root: Path, source: Path, config: Path) -> None:
+    """Write the pages and pictures of a clone to a new folder, and the site's settings to a file."""
+    for pattern in PAGES:
+        for page in root.glob(pattern):
+            _write(source / page.relative_to(root), _for_site(page, root, source))
+    shutil.copytree(root / "docs" / "pictures", source / "docs" / "pictures")
+    for drawing in (source / "docs" / "pictures").glob("*.svg"):
+        _two_drawings(drawing)
+    settings = (root / "zensical.toml").read_text(encoding="utf-8")
+    settings = settings.replace("[project]\n", f"[project]\nnav = {_nav(root)}\n{_about(root)}", 1)
+    config.write_text(settings, encoding="utf-8")
+
+
+def unfound(index: list[dict[str, Any]], searches: Iterable[str]) -> list[str]:
+    """Return the searches that find no section with all their words in its title, its text or the titles above."""
+    texts = [" ".join([item["title"], item["text"], *item["path"]]).lower() for item in index]
+    return [
+        words for words in searches if not any(all(word in text for word in words.lower().split()) for text in texts)
+    ]
 
 
 def _zensical() -> None:
@@ -86,13 +98,12 @@ def _zensical() -> None:
         sys.exit("the site could not be built: see above")
 
 
-def _write(path: str, text: str) -> None:
-    target = SOURCE / path
+def _write(target: Path, text: str) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_text(text, encoding="utf-8")
 
 
-def _for_site(page: Path) -> str:
+def _for_site(page: Path, root: Path, source: Path) -> str:
     """Return a page with the links that leave the documentation led to pages of code."""
 
     def link(found: re.Match[str]) -> str:
@@ -101,7 +112,7 @@ def _for_site(page: Path) -> str:
             return found[0]
         if (target / "README.md").is_file():
             return f"]({found[1].rstrip('/')}/README.md)"
-        return f"]({posixpath.relpath(_code_page(target), page.parent.relative_to(ROOT).as_posix())})"
+        return f"]({posixpath.relpath(_code_page(target, root, source), page.parent.relative_to(root).as_posix())})"
 
     text = LINK.sub(link, page.read_text(encoding="utf-8"))
     # the page has a switch of its own: a drawing that follows the screen would be dark on a light page
@@ -118,15 +129,15 @@ def _two_drawings(drawing: Path) -> None:
     drawing.with_name(f"{drawing.stem}-dark.svg").write_text(drawing_colours.dark(text), encoding="utf-8")
 
 
-def _about() -> str:
+def _about(root: Path) -> str:
     """Return the version and the repository for the head and foot of every page, as TOML.
 
     The repository is `Repository` of `[project.urls]`; without it, the place that this clone came from.
     """
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     version = f"afspm {project['version']}"
     lines = [f"site_name = {json.dumps(version)}", f"copyright = {json.dumps(version)}"]
-    repository = project.get("urls", {}).get("Repository") or _origin()
+    repository = project.get("urls", {}).get("Repository") or _origin(root)
     if repository:
         lines += [f"repo_url = {json.dumps(repository)}", 'repo_name = "repository"']
     else:
@@ -134,48 +145,43 @@ def _about() -> str:
     return "\n".join(lines) + "\n"
 
 
-def _origin() -> str:
+def _origin(root: Path) -> str:
     ask = ["git", "config", "--get", "remote.origin.url"]
-    url = subprocess.run(ask, cwd=ROOT, capture_output=True, encoding="utf-8", check=False).stdout.strip()
+    url = subprocess.run(ask, cwd=root, capture_output=True, encoding="utf-8", check=False).stdout.strip()
     return url if url.startswith("https://") else ""
 
 
-def _code_page(target: Path) -> str:
+def _code_page(target: Path, root: Path, source: Path) -> str:
     """Write a file, or the files of a folder, as a page; return its path."""
-    name = target.relative_to(ROOT).as_posix()
+    name = target.relative_to(root).as_posix()
     files = sorted(target.iterdir()) if target.is_dir() else [target]
     parts = [
         f"## {file.name}\n\n````{FENCES.get(file.suffix, 'text')}\n{file.read_text(encoding='utf-8')}\n````\n"
         for file in files
         if file.is_file() and file.suffix in (*FENCES, ".cff", "")
     ]
-    _write(f"{name}/index.md" if target.is_dir() else f"{name}.md", f"# {name}\n\n" + "\n".join(parts))
-    return f"{name}/index.md" if target.is_dir() else f"{name}.md"
+    page = f"{name}/index.md" if target.is_dir() else f"{name}.md"
+    _write(source / page, f"# {name}\n\n" + "\n".join(parts))
+    return page
 
 
-def _nav() -> str:
+def _nav(root: Path) -> str:
     """Return the navigation as TOML: the sections of docs/README.md."""
-    listing = (ROOT / "docs/README.md").read_text(encoding="utf-8")
+    listing = (root / "docs/README.md").read_text(encoding="utf-8")
     entries: list[str] = ['"README.md"']
     for title, text in SECTION.findall(listing):
         pages = [posixpath.normpath(f"docs/{target}") for target, _ in LINK.findall(text)]
-        shown = [_group(page) if page.endswith("/README.md") else json.dumps(page) for page in pages]
+        shown = [_group(root, page) if page.endswith("/README.md") else json.dumps(page) for page in pages]
         entries.append(f"{{ {json.dumps(title)} = [{', '.join(shown)}] }}")
     return "[\n  " + ",\n  ".join(entries) + ",\n]"
 
 
-def _group(listing: str) -> str:
+def _group(root: Path, listing: str) -> str:
     """Return a page that lists others, with these below it."""
-    folder = (ROOT / listing).parent
-    pages = [page.relative_to(ROOT).as_posix() for page in sorted(folder.rglob("*.md")) if page != ROOT / listing]
-    title = (ROOT / listing).read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
+    folder = (root / listing).parent
+    pages = [page.relative_to(root).as_posix() for page in sorted(folder.rglob("*.md")) if page != root / listing]
+    title = (root / listing).read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
     return f"{{ {json.dumps(title)} = {json.dumps([listing, *pages])} }}"
-
-
-def _finds(index: list[dict[str, Any]], words: str) -> bool:
-    """Return whether a section has all the words in its title, its text or the titles above, as the search wants it."""
-    texts = (" ".join([item["title"], item["text"], *item["path"]]).lower() for item in index)
-    return any(all(word in text for word in words.lower().split()) for text in texts)
 
 
 class _Page(HTMLParser):

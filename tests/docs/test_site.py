@@ -5,8 +5,10 @@ from __future__ import annotations
 import importlib
 import json
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -14,14 +16,26 @@ ROOT = Path(__file__).parents[2]
 HOW_TO = ["How to: measure", "How to: watch", "How to: after the night", "How to: extend"]
 
 
-@pytest.fixture
-def builder(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
-    return importlib.import_module("build_docs")
+@pytest.fixture(scope="module")
+def builder() -> Iterator[ModuleType]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "tools"))
+        yield importlib.import_module("build_docs")
 
 
-def test_how_to_pages_stand_in_four_groups(builder: ModuleType) -> None:
-    sections = tomllib.loads(f"nav = {builder._nav()}")["nav"][1:]
+@pytest.fixture(scope="module")
+def prepared(builder: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    builder.prepare(ROOT, folder / "pages", folder / "zensical.toml")
+    return folder
+
+
+def settings(config: Path) -> dict[str, Any]:
+    return tomllib.loads(config.read_text(encoding="utf-8"))["project"]  # type: ignore[no-any-return]
+
+
+def test_how_to_pages_stand_in_four_groups(prepared: Path) -> None:
+    sections = settings(prepared / "zensical.toml")["nav"][1:]
     groups = {title: pages for section in sections for title, pages in section.items()}
     assert list(groups) == ["Tutorials", *HOW_TO, "Reference", "Explanation"]
     shown = [page for title in HOW_TO for page in groups[title] if not page.startswith("packages/")]
@@ -29,9 +43,9 @@ def test_how_to_pages_stand_in_four_groups(builder: ModuleType) -> None:
     assert sorted(shown) == sorted(["CONTRIBUTING.md", *pages])
 
 
-def test_every_page_shows_the_version(builder: ModuleType) -> None:
+def test_every_page_shows_the_version(prepared: Path) -> None:
     version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
-    about = tomllib.loads(builder._about())
+    about = settings(prepared / "zensical.toml")
     assert about["site_name"] == about["copyright"] == f"afspm {version}"
 
 
@@ -44,7 +58,7 @@ def test_every_page_shows_the_version(builder: ModuleType) -> None:
     ],
 )
 def test_repository_link_comes_from_the_project_or_the_clone(
-    builder: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, declared: str, origin: str, linked: str | None
+    builder: ModuleType, tmp_path: Path, declared: str, origin: str, linked: str | None
 ) -> None:
     urls = f"[project.urls]\nRepository = {json.dumps(declared)}\n" if declared else ""
     (tmp_path / "pyproject.toml").write_text(f'[project]\nversion = "1.2"\n{urls}', encoding="utf-8")
@@ -53,29 +67,28 @@ def test_repository_link_comes_from_the_project_or_the_clone(
     (tmp_path / ".git/HEAD").write_text("ref: refs/heads/main\n")
     for folder in ("objects", "refs"):
         (tmp_path / ".git" / folder).mkdir()
-    monkeypatch.setattr(builder, "ROOT", tmp_path)
-    assert tomllib.loads(builder._about()).get("repo_url") == linked
+    (tmp_path / "docs/pictures").mkdir(parents=True)
+    (tmp_path / "docs/README.md").write_text("- **Start**: [first](first.md)\n", encoding="utf-8")
+    (tmp_path / "zensical.toml").write_text("[project]\n", encoding="utf-8")
+    builder.prepare(tmp_path, tmp_path / "pages", tmp_path / "build.toml")
+    assert settings(tmp_path / "build.toml").get("repo_url") == linked
 
 
-def test_site_shows_a_drawing_in_its_own_scheme(
-    builder: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shown = builder._for_site(ROOT / "docs/explanation/arbitration.md")
+def test_site_shows_a_drawing_in_its_own_scheme(prepared: Path) -> None:
+    shown = (prepared / "pages/docs/explanation/arbitration.md").read_text(encoding="utf-8")
     assert "control-transfer.svg#only-light" in shown
     assert "control-transfer-dark.svg#only-dark" in shown
-    drawing = tmp_path / "one.svg"
-    drawing.write_bytes((ROOT / "docs/pictures/control-transfer.svg").read_bytes())
-    builder._two_drawings(drawing)
-    light, dark = drawing.read_text(encoding="utf-8"), (tmp_path / "one-dark.svg").read_text(encoding="utf-8")
+    pictures = prepared / "pages/docs/pictures"
+    light = (pictures / "control-transfer.svg").read_text(encoding="utf-8")
+    dark = (pictures / "control-transfer-dark.svg").read_text(encoding="utf-8")
     assert 'fill="#ffffff"' in light
     assert 'fill="#ffffff"' not in dark
     assert "prefers-color-scheme" not in light + dark
 
 
-@pytest.mark.parametrize(("words", "found"), [("adhesion map", True), ("Map", True), ("adhesion film", False)])
-def test_search_wants_all_words_in_one_section(builder: ModuleType, words: str, found: bool) -> None:
+def test_search_wants_all_words_in_one_section(builder: ModuleType) -> None:
     index = [
         {"title": "Draw the map", "text": "the lowest force", "path": ["After the night", "Map adhesion"]},
         {"title": "Film", "text": "frames", "path": []},
     ]
-    assert builder._finds(index, words) is found
+    assert builder.unfound(index, ["adhesion map", "Map", "adhesion film"]) == ["adhesion film"]
