@@ -1,4 +1,4 @@
-"""A small file system, and how to fill it."""
+"""A small file system and how to fill it, and a small limit for the size of files."""
 
 from __future__ import annotations
 
@@ -32,3 +32,15 @@ def fill(file: Path) -> None:
             with suppress(OSError):
                 while stream.write(bytes(size)):
                     pass
+
+
+@contextmanager
+def file_limit(size: int) -> Iterator[None]:
+    """Let the system refuse bytes of files beyond a size, as a full disk does, which only root can make."""
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

@@ -128,9 +128,13 @@ class FileBatch:
         if _make_folder(path.parent):
             sync_folder(path.parent.parent)
         aside = path.with_name(path.name + self._suffix)
-        with aside.open("wb") as file:
-            file.write(data)
-            descriptor = os.dup(file.fileno())
+        try:
+            with aside.open("wb") as file:
+                file.write(data)
+                descriptor = os.dup(file.fileno())
+        except OSError:
+            aside.unlink(missing_ok=True)  # a full disk: half a file would keep the rest of its room
+            raise
         self._files.append((self._disk.submit(lambda: _sync_and_close(descriptor)), aside, path))
 
     def finish(self) -> None:

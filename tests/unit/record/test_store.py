@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import sqlite3
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from record_lab import ABOUT, REGION, START_NS, Given, Night, same
+from small_disk import file_limit
 from watched_disk import lossy_disk
 
 import afspm
@@ -300,20 +300,13 @@ def test_incomplete_scan_is_not_recorded_yet(night: Night, store: RecordStore) -
 
 
 def test_full_disk_leaves_no_partial_record_and_a_retry_succeeds(
-    night: Night, store: RecordStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    night: Night, store: RecordStore, tmp_path: Path
 ) -> None:
     given = [night.control(), *night.whole_scan(1)]
-    real = os.fsync
-
-    def full(descriptor: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space"):
+    with file_limit(1000), pytest.raises(OSError, match="File too large"):
         store.take(given)
     run = afspm.open_run(tmp_path)
     assert (len(run.scans), list(run.packets()), list((tmp_path / "scans").iterdir())) == (0, [], [])
-    monkeypatch.setattr(os, "fsync", real)
     store.take(given)
     assert same(list(run.packets()), given)
     assert len(run.scan(0)) == 2
