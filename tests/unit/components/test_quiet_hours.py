@@ -27,7 +27,7 @@ from afspm.scheduler.publishing.event_log import panel_entry
 from afspm.testing import Bench
 from afspm.testing.components.simulated_time import START_S
 
-UNIT_S = 600.0
+UNIT_S, BEGIN_S = 600.0, 180.0
 NUMBER = 254
 
 
@@ -73,8 +73,13 @@ def test_impossible_hours_are_refused(settings: dict[str, Any], words: str) -> N
         QuietHours(**settings)
 
 
+def seconds(units: float) -> float:
+    """Return the time in units of ten minutes as seconds; the quiet hours last from 1 to 2, and the run from 0.7."""
+    return BEGIN_S + (units - 1.0) * UNIT_S
+
+
 class Night:
-    """An experiment of scans, with quiet hours from one to two units of ten minutes after its begin."""
+    """An experiment of scans with quiet hours."""
 
     def __init__(
         self,
@@ -85,7 +90,7 @@ class Night:
         others: Mapping[str, Component] | None = None,
     ) -> None:
         begin, end = (
-            dt.datetime.fromtimestamp(START_S + units * UNIT_S, dt.UTC).strftime("%H:%M") for units in (1.0, 2.0)
+            dt.datetime.fromtimestamp(START_S + seconds(units), dt.UTC).strftime("%H:%M") for units in (1.0, 2.0)
         )
         self.bench = Bench(
             QuietHours(begin, end, zone="UTC", withdraw=withdraw),
@@ -96,7 +101,7 @@ class Night:
         )
 
     def go_to(self, units: float) -> None:
-        self.bench.run(until=units * UNIT_S)
+        self.bench.run(until=seconds(units))
 
     @property
     def control(self) -> ControlState:
@@ -121,7 +126,7 @@ class Night:
     @property
     def is_at_work(self) -> bool:
         before = self.scans
-        self.go_to(self.bench.now_s / UNIT_S + 0.25)
+        self.bench.run(until=self.bench.now_s + 0.25 * UNIT_S)
         return self.control.mode is ControlMode.AUTOMATED and not self.control.problems and self.scans > before
 
 
@@ -189,7 +194,7 @@ def test_person_who_clears_the_flag_lets_the_run_go_on(night: Night) -> None:
 @pytest.mark.parametrize("when", [0.93, 1.93])
 def test_kill_changes_nothing(tmp_path: Path, who: str, when: float) -> None:
     night = Night(tmp_path, withdraw=True)
-    night.bench.at(when * UNIT_S, night.bench.kill, who)
+    night.bench.at(seconds(when), night.bench.kill, who)
     night.go_to(1.9)
     assert night.is_paused
     night.go_to(2.2)
@@ -228,7 +233,7 @@ def test_tip_that_does_not_come_back_is_left_to_a_person(tmp_path: Path, caplog:
 
 
 @pytest.mark.parametrize(
-    "panel", [[(700.0, "x-engage"), (800.0, "x-retract")], [(700.0, "x-engage")]], ids=["and back", "alone"]
+    "panel", [[(280.0, "x-engage"), (380.0, "x-retract")], [(280.0, "x-engage")]], ids=["and back", "alone"]
 )
 def test_tip_that_a_person_has_moved_is_left_to_a_person(tmp_path: Path, panel: list[tuple[float, str]]) -> None:
     night = Night(tmp_path, withdraw=True, panel=panel)
@@ -238,7 +243,7 @@ def test_tip_that_a_person_has_moved_is_left_to_a_person(tmp_path: Path, panel: 
     night.bench.close()
 
 
-@pytest.mark.parametrize("at_s", [559.9, 560.0, 560.1, 560.3, 561.0])
+@pytest.mark.parametrize("at_s", [139.9, 140.0, 140.1, 140.3, 141.0])
 def test_pause_of_a_person_while_the_tip_is_withdrawn_outlasts_the_hours(tmp_path: Path, at_s: float) -> None:
     night = Night(tmp_path, withdraw=True)
     night.bench.at(at_s, night.bench.set_mode, ControlMode.MANUAL)
@@ -255,7 +260,7 @@ def test_act_while_the_component_was_away_is_seen(tmp_path: Path) -> None:
     night.go_to(1.9)
     night.bench.kill("quiet_hours", restarts=False)
     night.bench.set_mode(ControlMode.MANUAL)
-    night.bench.run(until=1170.0)
+    night.bench.run(until=seconds(1.95))
     process = night.bench._processes["quiet_hours"]
     process.banned = False
     process.start()
@@ -291,10 +296,10 @@ class Repair(Component):
 
 def test_no_problem_is_solved_while_the_tip_is_withdrawn(tmp_path: Path) -> None:
     night = Night(tmp_path, withdraw=True, others={"repair": Repair()})
-    night.bench.at(570.0, night.bench.flag, "tip-shape-changed")
+    night.bench.at(150.0, night.bench.flag, "tip-shape-changed")
     night.go_to(2.2)
     assert night.is_at_work
-    moved = [one.subject for one in night.entries if one.time_ns * 1e-9 > START_S + 565.0 and one.response == 0]
+    moved = [one.subject for one in night.entries if one.time_ns * 1e-9 > START_S + 145.0 and one.response == 0]
     assert next(one for one in moved if one in ("x-engage", "start-scan")) == "x-engage"
     assert night.actions_of("repair") == ["start-scan"]
     night.bench.close()
