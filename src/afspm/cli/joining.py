@@ -102,10 +102,22 @@ def say_nothing_runs(why: str, *, as_json: bool = False) -> NoReturn:
     _end_without_run(f"nothing runs here: {why}", as_json=as_json, running=False)
 
 
-def say_unreachable(folder: Path, computer: str, *, as_json: bool = False) -> NoReturn:
-    """End the command because a run on another computer does not answer: raises typer.Exit."""
-    what = f"{folder.resolve().name} was started on {computer}, and does not answer to this computer"
-    _end_without_run(f"{what} ({platform.node()}): run this command there", as_json=as_json, running=None)
+def say_unanswered(folder: Path, *, as_json: bool = False) -> NoReturn:
+    """End the command because the scheduler of a run does not answer: raises typer.Exit."""
+    from afspm.record import cut_off_message
+    from afspm.record.run_json import run_json_or_empty
+    from afspm.record.run_lock import other_computer
+
+    name = folder.resolve().name
+    if cut_off := cut_off_message(folder):
+        say_nothing_runs(f"no scheduler answers in {name}; {cut_off}", as_json=as_json)
+    if computer := other_computer(folder):
+        why = f"{name} was started on {computer}, and does not answer to this computer ({platform.node()})"
+        _end_without_run(f"{why}: run this command there", as_json=as_json, running=None)
+    why = f"no scheduler answers in {name}, though it has not ended"
+    if (run_json_or_empty(folder).get("guest") or {}).get("keys"):
+        why += f"; perhaps its scheduler lacks the public key of {TERMINAL}"
+    say_nothing_runs(why, as_json=as_json)
 
 
 def _end_without_run(why: str, *, as_json: bool, running: bool | None) -> NoReturn:
@@ -145,23 +157,13 @@ def _running(where: Path, *, as_json: bool, acts: bool) -> Path:
 @contextmanager
 def _only_if_running(folder: Path, *, as_json: bool) -> Iterator[None]:
     from afspm.basics.errors import ExperimentEnded, NoResponse
-    from afspm.record import cut_off_message
-    from afspm.record.run_json import run_json_or_empty
-    from afspm.record.run_lock import other_computer
 
     try:
         yield
     except ExperimentEnded as error:
         say_nothing_runs(str(error), as_json=as_json)
     except NoResponse:
-        if told := cut_off_message(folder):
-            say_nothing_runs(f"no scheduler answers in {folder.resolve().name}; {told}", as_json=as_json)
-        if name := other_computer(folder):
-            say_unreachable(folder, name, as_json=as_json)
-        said = f"no scheduler answers in {folder.resolve().name}, though it has not ended"
-        if (run_json_or_empty(folder).get("guest") or {}).get("keys"):
-            said += f"; perhaps its scheduler lacks the public key of {TERMINAL}"
-        say_nothing_runs(said, as_json=as_json)
+        say_unanswered(folder, as_json=as_json)
 
 
 def plain_table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> Table:

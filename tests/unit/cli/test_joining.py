@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -12,39 +11,25 @@ import typer
 from published_schemas import require_valid
 from typer.testing import CliRunner
 
-from afspm.basics.errors import NoResponse
 from afspm.cli.app import app
-from afspm.cli.joining import NOT_RUNNING, acting, looking, plain_console
+from afspm.cli.joining import NOT_RUNNING, looking, plain_console, say_unanswered
 from afspm.record.run_lock import cut_off_message, describe_state, lock_run
 
 
 @pytest.mark.parametrize("runs", [False, True], ids=["cut off", "it runs"])
 @pytest.mark.parametrize("keys", ["null", '{"folder": "keys"}'])
-@pytest.mark.parametrize("command", [looking, acting])
 def test_message_on_a_run_that_was_cut_off_names_resume_and_on_a_running_one_the_likely_fault(
-    command: Callable[[Path], AbstractContextManager[object]],
-    keys: str,
-    runs: bool,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    keys: str, runs: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def nobody(*_: object) -> None:
-        raise NoResponse("the scheduler does not answer")
-
     (tmp_path / "night-1" / "state").mkdir(parents=True)
     (tmp_path / "night-1" / "run.json").write_text(
         f'{{"name": "night", "guest": {{"keys": {keys}}}}}', encoding="utf-8"
     )
-    monkeypatch.setattr("afspm.client.connect.join", nobody)
-    monkeypatch.setattr("afspm.cli.follower.Follower.__init__", lambda *_, **_more: None)
-    monkeypatch.setattr("afspm.cli.follower.Follower.close", lambda *_: None)
-    monkeypatch.setattr("afspm.cli.follower.Follower.catch_up", nobody)
     with lock_run(tmp_path / "night-1"):
         pass
     held = lock_run(tmp_path / "night-1") if runs else nullcontext()
-    with held, pytest.raises(typer.Exit), command(tmp_path / "night-1"):
-        pass
+    with held, pytest.raises(typer.Exit):
+        say_unanswered(tmp_path / "night-1")
     said = capsys.readouterr().err
     assert "no scheduler answers in night-1" in said
     assert (f"it was cut off; `afspm run --resume {tmp_path / 'night-1'}` goes on with it" in said) is not runs
@@ -116,22 +101,16 @@ def test_program_learns_that_a_run_has_ended(command: str, tmp_path: Path) -> No
     assert "night-1 has ended (all plans are done)" in told["why"]
 
 
-def test_run_of_another_computer_is_not_called_cut_off(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def nobody(*_: object) -> None:
-        raise NoResponse("the scheduler does not answer")
-
+def test_run_of_another_computer_is_not_called_cut_off(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "night-1"
     (folder / "state").mkdir(parents=True)
     (folder / "run.json").write_text('{"name": "night", "computer": "lab-7", "guest": {}}', encoding="utf-8")
-    monkeypatch.setattr("afspm.client.connect.join", nobody)
     with lock_run(folder):
         pass
     assert cut_off_message(folder) == ""
     assert describe_state(folder) == "it goes on, or was cut off; lab-7, on which it was started, knows"
-    with pytest.raises(typer.Exit), acting(folder):
-        pass
+    with pytest.raises(typer.Exit):
+        say_unanswered(folder)
     assert "night-1 was started on lab-7, and does not answer to this computer" in capsys.readouterr().err
 
 
