@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from dataclasses import dataclass
+from typing import Any
 
 import pytest
 
 from afspm.basics import ExperimentClock, Launch
+from afspm.model import ControlResponse, Response
 from afspm.plugins.web.dashboard.access import Access, Visitor
 from afspm.plugins.web.dashboard.actions import ActionResult, Steering
 from afspm.plugins.web.dashboard.sessions import Sessions
-from afspm.plugins.web.persons import Persons
+from afspm.plugins.web.persons import Person, Persons
 from afspm.plugins.web.watch import Watch
 
 
@@ -19,38 +21,50 @@ def access() -> Access:
     return Access("127.0.0.1", "", {}, lambda: 1000.0, Sessions(None, lambda: 1000.0), {})
 
 
+@dataclass
+class Commands:
+    """The commands of a person, who can only end the experiment."""
+
+    person: str
+    ended_by: list[str]
+
+    def end(self) -> Response:
+        self.ended_by.append(self.person)
+        return Response(int(ControlResponse.SUCCESS))
+
+
 @pytest.fixture
-def steering(access: Access, monkeypatch: pytest.MonkeyPatch) -> Steering:
+def ended_by() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def steering(access: Access, ended_by: list[str]) -> Steering:
     clock = ExperimentClock.real()
     watch = Watch(clock)
-    persons = Persons(Launch("dashboard"), clock, watch)
-    monkeypatch.setattr(persons, "_connect", lambda person, hurried: (None, person))
-    return Steering(persons, watch, access)
+
+    def connect(person: str, _: Person) -> tuple[None, Any]:
+        return None, Commands(person, ended_by)
+
+    return Steering(Persons(Launch("dashboard"), clock, watch, connect), watch, access)
 
 
-def done(steering: Steering, visitor: Visitor) -> list[Any]:
-    """Return the names under which an action was carried out."""
-    asked: list[Any] = []
-
-    def act(actions: Any) -> ActionResult:
-        asked.append(actions._commands)
-        return ActionResult("done")
-
-    steering.do(visitor, act).result(5.0)
-    return asked
+def end(steering: Steering, visitor: Visitor) -> ActionResult:
+    return steering.do(visitor, lambda actions: actions.end()).result(5.0)
 
 
 @pytest.mark.parametrize("person", ["", " ", "a:b", "<b>"])
-def test_a_nameless_person_may_not_steer(steering: Steering, person: str) -> None:
-    assert done(steering, Visitor("Ada")) == ["Ada"]
-    assert done(steering, Visitor(person)) == []
-    assert "Sign in" in steering.do(Visitor(person), cast("Any", str)).result(5.0).text
+def test_a_nameless_person_may_not_steer(steering: Steering, ended_by: list[str], person: str) -> None:
+    end(steering, Visitor("Ada"))
+    assert "Sign in" in end(steering, Visitor(person)).text
+    assert ended_by == ["Ada"]
 
 
-def test_an_open_page_steers_no_more_after_signing_out(steering: Steering, access: Access) -> None:
+def test_an_open_page_steers_no_more_after_signing_out(steering: Steering, access: Access, ended_by: list[str]) -> None:
     cookie = access.enter("Ada", "", "x")
     visitor = access.visitor(cookie)
     assert visitor is not None
-    assert done(steering, visitor) == ["Ada"]
+    end(steering, visitor)
     access.leave(cookie)
-    assert done(steering, visitor) == []
+    end(steering, visitor)
+    assert ended_by == ["Ada"]

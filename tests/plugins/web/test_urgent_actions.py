@@ -42,16 +42,14 @@ def link() -> BusyMicroscope:
 
 
 @pytest.fixture
-def persons(link: BusyMicroscope, monkeypatch: pytest.MonkeyPatch) -> Persons:
+def persons(link: BusyMicroscope) -> Persons:
     watch = Watch(link.clock)
     watch.take("ScopeStateMsg", ScopeStatus(ScopeState.SCANNING), 1)
-    made = Persons(Launch("dashboard"), link.clock, watch)
 
     def connect(person: str, one: Any) -> tuple[Any, PersonCommands]:
         return None, PersonCommands(cast("ExperimentLink", link), watch, lambda: one.urgent > 0, one.meanwhile)
 
-    monkeypatch.setattr(made, "_connect", connect)
-    return made
+    return Persons(Launch("dashboard"), link.clock, watch, connect)
 
 
 def test_wait_for_a_region_ends_with_its_centre_size_and_angle(

@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 
 @dataclass
-class _Person:
+class Person:
     """A person's connection to the scheduler, used by one thread.
 
     Attributes:
@@ -43,19 +43,25 @@ class _Person:
         self.thread.shutdown(wait=False)
 
 
+Connect = Callable[[str, Person], tuple[ZmqPort | None, PersonCommands]]
+"""Connects a person by name, for the thread of the person's actions."""
+
+
 class Persons:
     """Thread-safe connections that send each person's requests to the scheduler in order, under the person's name.
 
     Args:
         launch: launch line of the component, with the scheduler's addresses and keys.
+        connect: connects a person; None: over a socket to the scheduler.
     """
 
-    def __init__(self, launch: Launch, clock: Clock, watch: Watch) -> None:
+    def __init__(self, launch: Launch, clock: Clock, watch: Watch, connect: Connect | None = None) -> None:
         self._launch = launch
         self._clock = clock
         self._watch = watch
+        self._connect = connect or self._connect_to_scheduler
         self._lock = threading.Lock()
-        self._persons: OrderedDict[str, _Person] = OrderedDict()
+        self._persons: OrderedDict[str, Person] = OrderedDict()
 
     def submit(
         self,
@@ -77,7 +83,7 @@ class Persons:
                 # the connection idle for longest is closed; its next request connects again
                 while len(self._persons) >= MOST_PERSONS:
                     self._persons.popitem(last=False)[1].close()
-                one = self._persons[person] = _Person(ThreadPoolExecutor(1, thread_name_prefix="person"))
+                one = self._persons[person] = Person(ThreadPoolExecutor(1, thread_name_prefix="person"))
             self._persons.move_to_end(person)
             one.urgent += urgent
             if meanwhile:
@@ -99,7 +105,7 @@ class Persons:
         for one in persons:
             one.close()
 
-    def _put_meanwhile(self, person: str, one: _Person, action: Callable[[PersonCommands], T]) -> Future[T]:
+    def _put_meanwhile(self, person: str, one: Person, action: Callable[[PersonCommands], T]) -> Future[T]:
         future: Future[T] = Future()
 
         def carry_out() -> None:
@@ -118,14 +124,14 @@ class Persons:
         one.thread.submit(carry_out_rest)  # if no action waits, or the last one has just ended
         return future
 
-    def _carry_out(self, person: str, one: _Person, action: Callable[[PersonCommands], T], urgent: bool) -> T:
+    def _carry_out(self, person: str, one: Person, action: Callable[[PersonCommands], T], urgent: bool) -> T:
         with self._lock:
             one.urgent -= urgent
         if one.commands is None:
             one.port, one.commands = self._connect(person, one)
         return action(one.commands)
 
-    def _connect(self, person: str, one: _Person) -> tuple[ZmqPort, PersonCommands]:
+    def _connect_to_scheduler(self, person: str, one: Person) -> tuple[ZmqPort, PersonCommands]:
         launch, name = self._launch, self.name_of(person)
         network = Network.from_launch(launch.name, launch.keys)
         port = ZmqPort(network, name, self._clock, control=launch.sockets.control)
