@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import os
 import secrets
@@ -281,6 +282,11 @@ class VendorBench(Generic[Emulated]):
             self.translator, given, self.folder, self._stack, self.clock, self._log, retracts=retracts
         )
         return self._process.peer
+
+    def events(self, kind: str) -> list[dict[str, Any]]:
+        """Return the events of a kind in the emulator's ground truth."""
+        lines = (self.data / "truth.jsonl").read_text(encoding="utf-8").splitlines()
+        return [event for event in map(json.loads, lines) if event["event"] == kind]
 
     def kill(self) -> None:
         """Kill the translator."""

@@ -666,27 +666,24 @@ def test_force_curve_from_the_panel_has_the_position_in_its_file(bench: Make) ->
 # --- the tip ---
 
 
-def test_pulse_restores_the_bias(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pulse_restores_the_bias(bench: Make) -> None:
     made = bench(speed=1.0)
     peer = made.start()
     ready(peer)
-    pulses: list[tuple[float, float]] = []
-    monkeypatch.setattr(made.emulator.rig, "pulsed", lambda *pulse: pulses.append(pulse[:2]))
     assert peer.set(names.TIP_BIAS_VOLTAGE, 0.5).ok
     assert peer.set(names.PULSE_VOLTAGE, -4.5).ok
     assert peer.set(names.PULSE_DURATION, "300", "ms").ok
-    pulses.clear()
     assert peer.act(names.PULSE).ok
     assert peer.act(names.START_SCAN).code == ControlResponse.NOT_FREE
     peer.until(FREE)
     assert peer.get(names.TIP_BIAS_VOLTAGE) == "0.5"
-    voltage_v, lasted_s = pulses[-1]
-    assert voltage_v == -4.5
-    assert lasted_s >= 0.3
+    pulse = made.events("pulse")[-1]
+    assert pulse["voltage_v"] == -4.5
+    assert pulse["duration_s"] >= 0.3
     assert peer.set(names.PULSE_VOLTAGE, 11).code == ControlResponse.PARAM_ERROR
 
 
-def test_crash_is_an_unsaved_indentation(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crash_is_an_unsaved_indentation(bench: Make) -> None:
     made = bench(speed=5.0)
     peer = made.start(
         parameters={
@@ -697,13 +694,12 @@ def test_crash_is_an_unsaved_indentation(bench: Make, monkeypatch: pytest.Monkey
         actions={"x-crash": {"set": {"x-save-force": 0}, "command": 'DoForceFunc "SingleForce"', "for": "3 s"}},
     )
     ready(peer)
-    crashes: list[tuple[float, float]] = []
-    monkeypatch.setattr(made.emulator.rig, "crash", lambda *crash: crashes.append(crash[:2]))
     assert peer.set(names.CRASH_DEPTH, 2, "um").ok
     assert peer.set(names.CRASH_SPEED, 5, "um/s").ok
     assert peer.act(names.CRASH).ok
     packets = peer.until(FREE)
-    assert crashes == [pytest.approx((2e-6, 5e-6))]
+    (crash,) = made.events("crash")
+    assert (crash["depth_m"], crash["speed_m_per_s"]) == pytest.approx((2e-6, 5e-6))
     assert not [one for one in packets if isinstance(one, Spectrum)]
     assert peer.get("x-save-force") == "2"
     assert not list(made.data.glob("*.ibw"))

@@ -19,7 +19,16 @@ from afspm.plugins.gxsm.emulator import GxsmEmulator
 
 
 class Emulated(AtPanel, GxsmEmulator):
-    """An emulated GXSM with a person at its panel."""
+    """An emulated GXSM with a person at its panel, that notes its answers."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.answered: list[tuple[str, tuple[object, ...], object]] = []
+
+    def answer(self, method: str, arguments: tuple[object, ...]) -> object:
+        found = super().answer(method, arguments)
+        self.answered.append((method, arguments, found))
+        return found
 
 
 class Bench(VendorBench[Emulated]):
@@ -49,20 +58,11 @@ ACTING = {"startscan", "stopscan", "set", "moveto_scan_xy"}
 
 
 class Calls:
-    """The calls that the emulated GXSM has answered."""
+    """The calls that the emulated GXSM answers from now on."""
 
-    def __init__(self, made: VendorBench[Any]) -> None:
+    def __init__(self, made: VendorBench[Emulated]) -> None:
         self.made = made
-        self.answered: list[tuple[str, tuple[object, ...], object]] = []
-        functions = made.emulator._calls
-        answer = functions.answer
-
-        def listening(method: str, arguments: tuple[object, ...]) -> object:
-            found = answer(method, arguments)
-            self.answered.append((method, arguments, found))
-            return found
-
-        functions.answer = listening
+        self.answered = made.emulator.answered = []
 
     def until_scan_is_seen(self) -> None:
         """Wait until the translator's poll has shown the scan: only then the names of its files are asked for."""

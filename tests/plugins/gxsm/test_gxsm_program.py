@@ -107,7 +107,7 @@ def test_faults_of_answers_spare_the_scripts_own_look(bench: Make, fault: str) -
     made = bench()
     made.strike(fault)
     found: list[object] = []
-    made.at_panel(lambda emulator: found.append(emulator._calls.answer("get", ("script-control",))))
+    made.at_panel(lambda emulator: found.append(emulator.answer("get", ("script-control",))))
     assert found == [1.0], "the script would end"
 
 

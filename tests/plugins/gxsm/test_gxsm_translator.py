@@ -363,12 +363,10 @@ def test_the_feedback_is_not_switched_by_actions_that_this_gxsm_lacks(bench: Mak
 
 
 @pytest.mark.parametrize("settings", [{}, {"card": "RPSPMC"}, {"card": "simulator"}], ids=["sranger", "rpspmc", "sim"])
-def test_pulse_restores_the_bias(bench: Make, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pulse_restores_the_bias(bench: Make, settings: dict[str, Any]) -> None:
     made = bench(speed=1.0, **settings)
     peer = made.start()
     ready(peer)
-    pulses: list[tuple[float, float]] = []
-    monkeypatch.setattr(made.emulator.rig, "pulsed", lambda *pulse: pulses.append(pulse[:2]))
     before = peer.get(names.TIP_BIAS_VOLTAGE)
     assert peer.set(names.PULSE_VOLTAGE, -4.5).ok
     assert peer.set(names.PULSE_DURATION, "300", "ms").ok
@@ -376,9 +374,9 @@ def test_pulse_restores_the_bias(bench: Make, settings: dict[str, Any], monkeypa
     assert peer.act(names.START_SCAN).code == ControlResponse.NOT_FREE
     assert states(peer.until(FREE)) == ["BUSY_PARAM", "FREE"]
     assert peer.get(names.TIP_BIAS_VOLTAGE) == before
-    ((voltage_v, lasted_s),) = pulses
-    assert voltage_v == -4.5
-    assert 0.3 <= lasted_s < 0.6
+    (pulse,) = made.events("pulse")
+    assert pulse["voltage_v"] == -4.5
+    assert 0.3 <= pulse["duration_s"] < 0.6
     assert peer.set(names.PULSE_VOLTAGE, 11).code == ControlResponse.PARAM_ERROR
 
 
@@ -394,7 +392,7 @@ def test_pulse_of_a_killed_translator_is_ended_by_the_next(bench: Make) -> None:
     assert made.emulator.rig.setup.bias_v == 0.1
 
 
-def test_crash_is_defined_in_the_experiment_file(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crash_is_defined_in_the_experiment_file(bench: Make) -> None:
     made = bench(speed=5.0)
     peer = made.start(
         parameters={
@@ -404,13 +402,12 @@ def test_crash_is_defined_in_the_experiment_file(bench: Make, monkeypatch: pytes
         actions={"x-crash": {"command": "DSP_VP_FZ_EXECUTE", "for": "2 s"}},
     )
     ready(peer)
-    crashes: list[tuple[float, float]] = []
-    monkeypatch.setattr(made.emulator.rig, "crash", lambda *crash: crashes.append(crash[:2]))
     assert peer.set(names.CRASH_DEPTH, 2, "nm").ok
     assert peer.set(names.CRASH_SPEED, 50, "nm/s").ok
     assert peer.act(names.CRASH).ok
     assert states(peer.until(FREE)) == ["BUSY_PARAM", "FREE"]
-    assert crashes == [pytest.approx((2e-9, 50e-9))]
+    (crash,) = made.events("crash")
+    assert (crash["depth_m"], crash["speed_m_per_s"]) == pytest.approx((2e-9, 50e-9))
 
 
 def test_missing_hardware_features_are_not_supported(bench: Make) -> None:

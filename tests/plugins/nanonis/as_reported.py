@@ -88,7 +88,7 @@ FACTS: Final[dict[str, Fact]] = {
     as_reported.CONTINUOUS: Fact(holds=lambda emulated: not emulated.software.scans.properties.continuous),
     as_reported.LATE_STATUS: Fact(),
     as_reported.OTHER_LAYOUT: Fact("is chosen in Nanonis' Scan Control, and can't be read"),
-    as_reported.WEDGED_PORT: Fact(holds=lambda emulated: not emulated._server._silent),
+    as_reported.WEDGED_PORT: Fact(holds=lambda emulated: not emulated.wedged_ports),
     as_reported.CLOSED_MODULES: Fact("Tip ?Shaper", lambda peer: [peer.act(names.CRASH)]),
     as_reported.BLOCKING_PULSE: Fact(tries=_pulses),
     as_reported.SLOW_SHAPER: Fact(tries=_shapes_and_scans),

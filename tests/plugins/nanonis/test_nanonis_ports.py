@@ -43,7 +43,7 @@ def answers_late(emulated: Emulated) -> bool:
 
 
 def wedged(emulated: Emulated) -> int:
-    return len(emulated._server._silent)
+    return emulated.wedged_ports
 
 
 def is_withdrawn(emulated: Emulated) -> bool:

@@ -140,6 +140,11 @@ class TcpServer:
             is_gone = True
         (self._reset if is_gone else self.cut)(connection)
 
+    @property
+    def wedged(self) -> int:
+        """Return the number of ports that answer nothing any more."""
+        return len(self._silent)
+
     def wedge(self, connection: ClientConnection) -> None:
         """Let the connection's port accept connections, and answer nothing any more."""
         self._silent.add(self._of[connection])

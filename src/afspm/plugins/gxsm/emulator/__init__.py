@@ -170,6 +170,10 @@ class GxsmEmulator(Emulator):
             self._block.end()
             self._block = None
 
+    def answer(self, method: str, arguments: tuple[object, ...]) -> object:
+        """Call a function of GXSM, with the errors of `GxsmFunctions.answer`."""
+        return self._calls.answer(method, arguments)
+
     def _post(self, call: ScriptCall) -> None:
         self.unanswered.append(call)
         self.woken.post()
@@ -179,7 +183,7 @@ class GxsmEmulator(Emulator):
             call = self.unanswered.popleft()
             self.program.advance(self.clock.now_s())  # GXSM's calls and its own work alternate in one thread
             try:
-                found = self._calls.answer(call.method, call.arguments)
+                found = self.answer(call.method, call.arguments)
             except NoAnswer:
                 self.silent = True
                 return

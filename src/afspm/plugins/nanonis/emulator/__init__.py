@@ -240,6 +240,11 @@ class NanonisEmulator(Emulator):
         self._reply(connection, waits.asked, results)
         return None
 
+    @property
+    def wedged_ports(self) -> int:
+        """Return the number of ports that accept connections and answer nothing any more."""
+        return self._server.wedged
+
     def close(self) -> None:
         """Close the listening socket, if the emulator was started."""
         if hasattr(self, "_server"):
