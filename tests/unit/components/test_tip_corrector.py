@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import errno
 import logging
-import os
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from client_lab import REGION, SCAN_S, Kill9, Lab, LabPort, context_of, run
+from small_disk import file_limit
 from tests.unit.components.tip_scans_lab import ELSEWHERE, HOME, channels
 
 from afspm import wire
@@ -457,43 +457,33 @@ def test_treatment_without_an_answer_is_not_requested_again(is_done: bool) -> No
     assert lab.problems == ()
 
 
-def test_treatment_that_can_not_be_saved_is_not_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def full(descriptor: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
+def test_treatment_that_can_not_be_saved_is_not_made(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     lab = Repairs([BAD] * 9)
     lab.at(10.0, lambda: lab.flag(TIP))
     lab.at(5000.0, lab.kill)
-    monkeypatch.setattr(os, "fsync", full)
-    run(corrector(), lab, tmp_path)
+    with file_limit(0):
+        run(corrector(), lab, tmp_path)
     assert lab.actions == []
     assert lab.problems == (TIP, MALFUNCTION)
     assert "the tip can't be repaired: the disk is full" in caplog.text
 
 
 def test_tip_is_repaired_once_the_disk_has_room_and_a_person_cleared_the_flag(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    fsync, is_full = os.fsync, True
-
-    def disk(descriptor: int) -> None:
-        if is_full:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        fsync(descriptor)
+    full = ExitStack()
 
     def person() -> None:
-        nonlocal is_full
-        is_full = False
+        full.close()
         lab.clear(MALFUNCTION)
 
     lab = Repairs([BAD, GOOD])
     lab.at(10.0, lambda: lab.flag(TIP))
     lab.at(5000.0, person)
     lab.at(9000.0, lab.kill)
-    monkeypatch.setattr(os, "fsync", disk)
-    run(corrector(), lab, tmp_path)
+    with full:
+        full.enter_context(file_limit(0))
+        run(corrector(), lab, tmp_path)
     assert len(lab.actions) == 2
     assert lab.problems == ()
 

@@ -6,9 +6,9 @@ import errno
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
+from small_disk import file_limit
 
 from afspm.model import LoggedPacket, Packet
 from afspm.storage import packet_log
@@ -256,26 +256,12 @@ def test_a_segment_that_can_not_be_freed_yet_is_freed_later(
 def test_a_full_disk_is_not_filled_with_files_nor_with_halves(logging: Logging, folder: Path) -> None:
     log = logging()
     log.append(entry(1))
-    segment = log._segment
-    assert segment is not None
-    real = segment._file
-
-    class Full:
-        """A disk with room for a few bytes."""
-
-        def write(self, data: memoryview) -> int:
-            real.write(data[:3])
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-        def __getattr__(self, name: str) -> Any:
-            return getattr(real, name)
-
-    segment._file = Full()  # type: ignore[assignment]
-    for time_ns in range(2, 20):
-        with pytest.raises(OSError, match="No space"):
-            log.append(entry(time_ns))
+    (file,) = folder.iterdir()
+    with file_limit(file.stat().st_size + 3):
+        for time_ns in range(2, 20):
+            with pytest.raises(OSError, match="File too large"):
+                log.append(entry(time_ns))
     assert len(list(folder.iterdir())) == 1
-    segment._file = real
     log.append(entry(20))
     assert times(folder) == [1, 20]
 
