@@ -12,9 +12,10 @@ from afspm.drawing import timeline
 from afspm.drawing.image_html import data_url
 from afspm.model import ScopeState, component_of
 from afspm.model.events import SUPERVISOR
+from afspm.model.planned_work import PlannedWork
 from afspm.night import ROUTINE, Timeline, instrument_curves
 from afspm.night.tables import ScanRow
-from afspm.report import agents, curves, estimate, markup, parameters, proofs, sample, shadow
+from afspm.report import agents, curves, markup, parameters, proofs, sample, shadow
 from afspm.report.curves import SpectrumGroup
 from afspm.report.markup import PageTimes, document, section, table
 from afspm.report.pictures import FigurePicture, TopographyPicture
@@ -36,7 +37,7 @@ def html(
     places = [position for group in spectra for position in group.positions]
     body = [
         f"<header><h1>{escape(story.name)}{badge}</h1>{_sample_line(story)}{_duration_line(story, clock)}</header>",
-        section("", _cards(story) + estimate.html(story)),
+        section("", _cards(story) + _work(story)),
         section("Time line", f'<div class="scroll">{_timeline(story)}</div>{_zones(clock)}'),
         section("What afspm would have done", shadow.html(story.shadow, clock)),
         section("Problems and repairs", _problems(story, clock)),
@@ -65,6 +66,34 @@ def html(
 _UNDEFINED = ScopeState.UNDEFINED.name.lower()
 _NOT_KNOWN = "not known, at the start or end"
 _SMALLEST_REST = 0.005  # of the time: shown as 1 %
+
+
+def _work(story: RunStory) -> str:
+    # two rows for each component with a plan
+    rows = []
+    for one in story.comparisons:
+        planned = "planned at most" if one.planned.at_most else "planned"
+        rows.append([escape(one.name), planned, *_work_cells(one.planned)])
+        rows.append(["", "measured", *_work_cells(one.measured)])
+    if not rows:
+        return ""
+    # the plan leaves computing out, which a fast clock multiplies by its speed
+    computing = "" if story.real_s is None else ", and with the real time of computing times the speed of the clock"
+    note = (
+        "Both durations are in experiment time. The measured one goes from the first scan or spectrum to the end of "
+        f"the last, with pauses and repairs{computing}."
+    )
+    made = table(["component", "", "scans", "spectra", "path", "duration"], rows)
+    return f'{made}<p class="note">{note}</p>'
+
+
+def _work_cells(work: PlannedWork) -> list[str]:
+    return [
+        "without end" if work.scans is None else str(work.scans),
+        str(work.spectra),
+        quantity(work.path_m, "m", 3),
+        "not known" if work.duration_s is None else duration_text(work.duration_s),
+    ]
 
 
 def _timeline(story: RunStory) -> str:

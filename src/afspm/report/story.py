@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from afspm.basics.clock import NS_PER_S
 from afspm.basics.formatting import counted
 from afspm.drawing import TimelineRow
 from afspm.model import (
@@ -19,6 +20,7 @@ from afspm.model import (
     ScopeState,
     names,
 )
+from afspm.model.planned_work import PlannedWork, path_length_m
 from afspm.night import Overview, Span, Timeline, plans_of
 from afspm.night.overview import ProcessRestart
 from afspm.night.run import Run
@@ -29,7 +31,6 @@ from afspm.record import bands_allowed as allowed_bands
 from afspm.record.run_json import REAL_S, UNFINISHED
 from afspm.report import agents, parameters, proofs, shadow
 from afspm.report.proofs import ResultProofs
-from afspm.report.work_comparison import WorkComparison, compare
 from afspm.wire.messages import WatchCounts
 
 COLOURS = 5  # of holders, repeated in turn: the CSS classes c0 to c4
@@ -47,6 +48,18 @@ class Refusals:
     count: int
     first_ns: int
     last_ns: int
+
+
+@dataclass(frozen=True)
+class WorkComparison:
+    """The planned and the measured work of a component.
+
+    The measured duration extends from the start of the first to the end of the last scan or spectrum, with pauses.
+    """
+
+    name: str
+    planned: PlannedWork
+    measured: PlannedWork
 
 
 @dataclass(frozen=True)
@@ -198,7 +211,7 @@ def read(run: Run) -> RunStory:
         ],
         notes=list(run.notes),
         seen_late=list({entry.problem: entry for entry in reversed(late)}.values()),
-        comparisons=compare(plans_of(run.facts), scans, spectra),
+        comparisons=_compared(plans_of(run.facts), scans, spectra),
         agents=agents.read(run),
         changes=parameters.read(run),
         bands=allowed_bands(run.folder),
@@ -314,3 +327,35 @@ def timeline_rows(story: RunStory) -> Iterator[TimelineRow]:
 
 def _row(name: str, style: str, spans: Iterable[Span]) -> TimelineRow:
     return TimelineRow(name, spans, lambda _: style)
+
+
+def _compared(
+    planned: Mapping[str, PlannedWork | None], scans: Sequence[ScanRow], spectra: Sequence[SpectrumRow]
+) -> list[WorkComparison]:
+    # a scan or spectrum counts for the component in control at its start; interrupted scans do not count
+    return [
+        WorkComparison(
+            name,
+            plan,
+            _measured_work(
+                [scan for scan in scans if scan.holder == name and not scan.interrupted],
+                [spectrum for spectrum in spectra if spectrum.holder == name],
+            ),
+        )
+        for name, plan in planned.items()
+        if plan is not None
+    ]
+
+
+def _measured_work(scans: list[ScanRow], spectra: list[SpectrumRow]) -> PlannedWork:
+    rows: list[ScanRow | SpectrumRow] = [*scans, *spectra]
+    began_ns = min((row.time_ns if row.began_ns is None else row.began_ns for row in rows), default=0)
+    lasted_ns = max((row.time_ns for row in rows), default=0) - began_ns
+    seen = [(scan.region, scan.shape) for scan in scans if scan.region is not None and scan.shape is not None]
+    return PlannedWork(
+        scans=len(scans),
+        spectra=len(spectra),
+        path_m=sum(path_length_m(region, shape[0]) for region, shape in seen),
+        pixels=sum(shape[0] * shape[1] for _, shape in seen),
+        duration_s=lasted_ns / NS_PER_S,
+    )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +22,8 @@ from afspm.model import ControlResponse, ScanLines, ScopeState, Spectrum, names
 from afspm.simulation.activities import Channels, ScanActivity, SpectrumActivity
 from afspm.simulation.faults import Faults
 from afspm.simulation.instrument import InstrumentBusy, SimulatedInstrument
-from afspm.simulation.simulator import curves
+from afspm.simulation.spectra import SweptCurve
+from afspm.simulation.world import WorldSettings
 from afspm.storage.atomic import write_atomic
 from afspm.translator.own_files import FileFacts, encode_scan
 from afspm.translator.parameters import FEEDBACK_ON, ParameterTable, Value
@@ -33,6 +34,8 @@ LISTED_RESULTS = 16
 ADJUSTED: Final = (names.ZCTRL_SETPOINT, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN, names.TIP_BIAS_VOLTAGE)
 """Parameters that take effect from the next line on when set during a scan."""
 
+_OF_KIND: Final = (*names.SPEC_Z_ENDS, names.SPEC_POINTS, names.SPEC_POINT_TIME)
+"""Settings that each kind of curve has for itself."""
 _STATES: Final = {
     "": ScopeState.FREE,
     "scan": ScopeState.SCANNING,
@@ -197,14 +200,14 @@ class SimulatedController:
         self._keep()
 
     def _curves_at_first(self, kind: str) -> dict[str, Value]:
-        found = curves.at_first(kind, self.instrument.world.settings)
+        found = _first_settings(kind, self.instrument.world.settings)
         return {name: self._table[name].to_vendor(value) for name, value in found.items() if name in self._table}
 
     def _choose_kind(self, kind: str) -> None:
         values, of_kinds = self._kept["values"], self._kept.setdefault("curves", {})
-        of_kinds[values[names.SPEC_KIND]] = {name: values[name] for name in curves.OF_KIND if name in values}
+        of_kinds[values[names.SPEC_KIND]] = {name: values[name] for name in _OF_KIND if name in values}
         of_kind = of_kinds.get(kind) or self._curves_at_first(kind)
-        values.update({name: value for name, value in of_kind.items() if name in curves.OF_KIND})
+        values.update({name: value for name, value in of_kind.items() if name in _OF_KIND})
 
     def _put_in_force(self) -> None:
         values, setup = self._si(), self.instrument.setup
@@ -237,7 +240,7 @@ class SimulatedController:
         if not self._faults.strikes("spectrum-refused", now_s):
             with _refusing():
                 kind = str(self._kept["values"][names.SPEC_KIND])
-                self.instrument.start_spectrum(kind, now_s, curve=curves.swept(kind, self._si()))
+                self.instrument.start_spectrum(kind, now_s, curve=_swept(kind, self._si()))
             self._measures()
 
     def stop(self, now_s: float) -> None:
@@ -401,3 +404,36 @@ def _in_single_precision(scan: ScanActivity) -> Channels:
     return {
         name: (unit, values.astype(np.float32).astype(np.float64)) for name, (unit, values) in scan.channels().items()
     }
+
+
+def _first_settings(kind: str, world: WorldSettings) -> dict[str, float]:
+    # before they are changed, by generic names, in SI
+    iv, force, z = world.iv, world.force, world.z
+    of_kind = world.of_curves(kind)
+    nearest_m, farthest_m = (z.nearest_m, z.farthest_m) if kind == "z" else (-force.range_m, force.range_m)
+    return {
+        names.SPEC_FROM: -iv.range_v,
+        names.SPEC_TO: iv.range_v,
+        names.SPEC_Z_FROM: nearest_m,
+        names.SPEC_Z_TO: farthest_m,
+        names.SPEC_POINTS: of_kind.points,
+        names.SPEC_POINT_TIME: of_kind.duration_s / (2.0 * of_kind.points),
+        names.SPEC_Z_OFFSET: 0.0,
+        names.LOCK_IN_AMPLITUDE: iv.modulation_v,
+    }
+
+
+def _swept(kind: str, values: Mapping[str, Value]) -> SweptCurve:
+    # settings by generic names, in SI; a table of parameters may lack some
+    def number(name: str) -> float | None:
+        return float(values[name]) if name in values else None
+
+    first, last = map(number, names.SPEC_ENDS if kind == "IV" else names.SPEC_Z_ENDS)
+    points = number(names.SPEC_POINTS)
+    return SweptCurve(
+        None if first is None or last is None else (first, last),
+        None if points is None else int(points),
+        number(names.SPEC_POINT_TIME),
+        number(names.SPEC_Z_OFFSET) or 0.0,
+        number(names.LOCK_IN_AMPLITUDE),
+    )
