@@ -11,6 +11,9 @@ from benchmarks.adaptive import GOAL, Case, course
 from afspm.basics import InvalidValue
 from afspm.model import Region
 from afspm.plugins.adaptive.gaussian_process import GaussianProcess, Parameters, fitted
+from afspm.plugins.adaptive.map_picture import draw_map
+from afspm.plugins.adaptive.mapping import MapProgress, MeasuredPoint, Until
+from afspm.plugins.adaptive.quantities import evaluation
 from afspm.plugins.adaptive.refinement import (
     AdaptiveMap,
     LatticeMap,
@@ -196,3 +199,13 @@ def test_map_goes_on_when_the_whole_first_lattice_has_failed() -> None:
     for _ in range(9):
         planned.register_failures(planned.suggest())
     assert len(measure(planned, 20)) == 20
+
+
+def test_picture_of_a_map_names_its_quantity_in_words() -> None:
+    planned = NestedGrid(REGION, "contact_potential")
+    points = enumerate(planned.suggest(9))
+    found = MapProgress(planned, REGION, evaluation("contact_potential"), Until())
+    found.restore([MeasuredPoint(one["_id"], one["x"], one["y"], 0.1 * n, float(n), 1.0) for n, one in points], [])
+    figure = draw_map(found, REGION, title="map")
+    assert [axes.get_ylabel() for axes in figure.axes[2:]] == ["contact potential / mV", "expected error / mV"]
+    assert figure.texts[0].get_text() == "map, contact potential, 9 spectra"

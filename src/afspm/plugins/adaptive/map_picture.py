@@ -34,7 +34,7 @@ def draw_map(found: MapProgress, region: Region, *, title: str = "", simulated: 
     figure = Figure(figsize=(_WIDTH_IN, height_in), facecolor="white")
     FigureCanvasAgg(figure)
     unit = found.evaluation.unit
-    of = found.evaluation.name
+    of = found.evaluation.name.replace("_", " ")
     left = figure.add_axes((0.015, 0.04, 0.40, 1.0 - 0.55 / height_in - 0.04))
     right = figure.add_axes((0.515, 0.04, 0.40, 1.0 - 0.55 / height_in - 0.04))
     size_um = tuple(1e6 * size for size in region.size_m)
