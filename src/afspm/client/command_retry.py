@@ -34,9 +34,9 @@ RETRY_S = 1.0  # before a repetition, unless a state is published earlier
 STATE_WITHIN_S = 5.0  # before the warning that the microscope has published no state
 CONNECTED_WITHIN_S = 5.0  # before the warning that the scheduler has no connection to the translator (yet)
 SETTLED_WITHIN_S = 2.0  # for the publication of a setting; without a change there is none
+# real time that a free microscope must stay free until an action counts as not begun, once the translator has answered
+# that it never learns the outcome. A controller that is back may begin late: Nanonis moves the tip first, up to 10 s.
 LOST_AFTER_S = 2 * CUT_OFF_SHOWS_WITHIN_S
-"""Real time that a free microscope must stay free until an action counts as not begun, once the translator has answered
-that it never learns the outcome. A controller that is back may begin late: Nanonis moves the tip first, up to 10 s."""
 ASK_FREE_AGAIN_S = 5.0  # in case the state FREE was lost
 ASK_BUSY_AGAIN_S = 25.0  # the same after another state than FREE
 

@@ -64,36 +64,36 @@ class JudgeSettings:
     near: tuple[int, int] = (1, 2)  # the same about a shift that a search has found
     most_jumps: int = 3  # in one scan
     remembered: int = 24  # lines for the search after a jump
+    # standard deviations beyond the usual, by the median of these lines, up to which a jump explains them. With 1, a
+    # jump of the sample was taken for a changed tip in row 11 of an unseen night.
     explained: float = 1.5
-    """Standard deviations beyond the usual, by the median of these lines, up to which a jump explains them. With 1, a
-    jump of the sample was taken for a changed tip in row 11 of an unseen night."""
     newest: int = 4  # lines since a change that a jump must explain, at least
     per_pixel: float = 0.03  # standard deviations that a pixel of a jump costs: short jumps are likelier than long ones
     drift: float = 1.0  # standard deviations above the usual difference beyond which a line lets the sum grow
+    # in pixels: two scans without drift between them show too small a misfit of steep flanks
     least_per_slope: float = 0.06
-    """In pixels: two scans without drift between them show too small a misfit of steep flanks."""
     spike: float = 6.0  # standard deviations beyond which a single pixel of a good scan is removed as a spike
     scar: float = 4.0  # standard deviations beyond which a row of a good scan is no measure of later ones
     most: float = 6.0  # standard deviations that one line adds at most
+    # least threshold. A floor of 20, in place of the least alike of few pairs (`ENOUGH_PAIRS`), stopped 8 of 512 good
+    # scans instead of 6.
     floor: float = 15.0
-    """Least threshold. A floor of 20, in place of the least alike of few pairs (`ENOUGH_PAIRS`), stopped 8 of 512 good
-    scans instead of 6."""
     factor: float = 2.0  # of a threshold to the highest sum of good scans
+    # rows since a change before an alarm: three fit wrong places of a flat step, as after a jump
     fewest_suspect: int = 6
-    """Rows since a change before an alarm: three fit wrong places of a flat step, as after a jump."""
+    # rows since a change before a scan is stopped, after a second search for a jump with more lines. With six, an
+    # unseen night was stopped 68 rows before its tip changed; with ten, 7 rows after.
     fewest_stop: int = 10
-    """Rows since a change before a scan is stopped, after a second search for a jump with more lines. With six, an
-    unseen night was stopped 68 rows before its tip changed; with ten, 7 rows after."""
     look: float = 0.6  # share of the threshold above which a person should look
+    # number and width, relative to the line, of parts that a changed sample may fill
     parts: tuple[tuple[int, float], ...] = ((1, 1 / 4), (2, 1 / 8))
-    """Number and width, relative to the line, of parts that a changed sample may fill."""
     elsewhere: float = 0.4  # share of the threshold that the rest of the lines must reach before a scan is stopped
+    # share of the rows for which a sum grows before the change counts as the tip's, and not as a single adsorbate's.
+    # Without this rule a double tip among few particles in 64 rows never stopped a scan.
     lasting: float = 3 / 8
-    """Share of the rows for which a sum grows before the change counts as the tip's, and not as a single adsorbate's.
-    Without this rule a double tip among few particles in 64 rows never stopped a scan."""
+    # power of a hum relative to the frequencies beside it. Of 80 scans with hum, 20 raised an alarm, 19 of these with
+    # such a peak; so did 7 of 45 changed tips, and were stopped in the same rows without it.
     hum_peak: float = 6.0
-    """Power of a hum relative to the frequencies beside it. Of 80 scans with hum, 20 raised an alarm, 19 of these with
-    such a peak; so did 7 of 45 changed tips, and were stopped in the same rows without it."""
     beside_hum: tuple[float, float] = (2.5, 5.5)  # periods per line from the peak: a Hann window widens it by two
     finer: int = 8  # steps of frequency in a period per line: two steps off leave a twentieth of a hum's power
     most_hums: int = 3  # frequencies in one scan
