@@ -73,6 +73,8 @@ class Cryostat:
         fault: of FAULTS, while it lasts.
         fastest_k_min: highest rate of the ramp.
         range_k: lowest and highest target; None: no bounds.
+        switch_is_readonly: the ramp can't be switched on.
+        decimals: of a target after the answer.
         is_busy: the status; None: busy while the temperature is away from the target.
     """
 
@@ -92,6 +94,8 @@ class Cryostat:
     disturbance_k: float = 0.0
     clock_s: float = 1e9
     old: str = ""
+    switch_is_readonly: bool = False
+    decimals: int = 9
 
     def run(self, dt_s: float) -> None:
         self.clock_s += dt_s
@@ -127,7 +131,7 @@ class Cryostat:
         elif specifier == f"tt:{self.ramp_switch}":
             self.is_ramp_on = bool(value)
         else:
-            self.target_k = value
+            self.target_k = round(value, self.decimals)
         return f"changed {specifier} [{json.dumps(value)}, {{}}]"
 
     def _report(self, action: str, accessible: str) -> str:
@@ -167,7 +171,7 @@ class Cryostat:
             accessibles["ramp"] = number(f"{self.unit}/min", readonly=False)
             accessibles["ramp"]["datainfo"]["max"] = self.fastest_k_min
         if self.ramp_switch:
-            accessibles[self.ramp_switch] = {"datainfo": {"type": "bool"}, "readonly": False}
+            accessibles[self.ramp_switch] = {"datainfo": {"type": "bool"}, "readonly": self.switch_is_readonly}
         return {"modules": {"tt": {"accessibles": accessibles}}}
 
 

@@ -9,7 +9,6 @@ import os
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import pytest
 from tests.plugins.secop.ramp_night import FAULTS, RATE_K_S, Cryostat, RampNight
@@ -123,18 +122,10 @@ def test_steps_begin_at_a_value_that_was_moved_away_from_beside_the_target(bench
 
 
 def test_steps_go_on_at_a_server_that_rounds_a_target_after_its_answer(bench: Bench) -> None:
-    change = bench.cryostat._change
-
-    def rounded(specifier: str, value: float) -> str:
-        answer = change(specifier, value)
-        bench.cryostat.target_k = round(value, 2)
-        return answer
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bench.cryostat, "_change", rounded)
-        bench.order("4.4123")
-        for _ in range(10):
-            bench.later(1.0)
+    bench.cryostat.decimals = 2
+    bench.order("4.4123")
+    for _ in range(10):
+        bench.later(1.0)
     assert bench.changes[-1] == 4.4123
     bench.later(1.0)
     (reading,) = bench.client.readings(bench.now_s)
@@ -223,17 +214,9 @@ def test_ramp_of_the_server_may_be_slower_than_the_limit() -> None:
 
 
 def test_target_is_moved_in_steps_if_the_ramp_can_not_be_switched_on() -> None:
-    bench = Bench(Cryostat(has_ramp=True, chance=random.Random(1), ramp_switch="ramp_enable"))
-    describe = bench.cryostat._description
-
-    def read_only() -> object:
-        told: Any = describe()
-        told["modules"]["tt"]["accessibles"]["ramp_enable"]["readonly"] = True
-        return told
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bench.cryostat, "_description", read_only)
-        bench.connect()
+    chance = random.Random(1)
+    bench = Bench(Cryostat(has_ramp=True, chance=chance, ramp_switch="ramp_enable", switch_is_readonly=True))
+    bench.connect()
     bench.order("20")
     assert bench.changes == [pytest.approx(4.2, abs=0.01)]
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import zmq
+from zmq.auth import load_certificate
 from zmq.utils import z85
 
 from afspm.basics.clock import ExperimentClock
@@ -158,11 +159,11 @@ def test_key_made_during_the_run_is_accepted(tmp_path: Path, open_: Any, until: 
 def test_connection_during_the_writing_of_a_key_does_no_harm(tmp_path: Path) -> None:
     keys.generate(tmp_path, ["translator", "late"])
     whole = (tmp_path / "public" / "late.key").read_bytes()
+    key = z85.decode(load_certificate(tmp_path / "public" / "late.key")[0])
     (tmp_path / "public" / "late.key").unlink()
     own = keys.load(tmp_path, "translator")
     context: zmq.Context[Any] = zmq.Context()
     authenticator = Authenticator(context, own)
-    key = z85.decode(keys._read(tmp_path / "private" / "late.key_secret", "late")["public-key"])
     knock = [b"1.0", b"1", b"afspm", b"", b"", b"CURVE", key]
     (tmp_path / "public" / "late.key").write_bytes(b"")
     assert authenticator.answer(knock)[2] == b"400"
