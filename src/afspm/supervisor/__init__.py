@@ -25,9 +25,8 @@ if TYPE_CHECKING:
     from afspm.supervisor.run import RunOptions
     from afspm.supervisor.run import run as run_experiment
 
-if TYPE_CHECKING:  # a page rehearses runs, a replay says when it is
+if TYPE_CHECKING:  # a page rehearses runs
     from afspm.supervisor.run import dry_run
-    from afspm.supervisor.run import now as run_time
 
 __all__ = [
     "FreePorts",
@@ -36,7 +35,6 @@ __all__ = [
     "dry_run",
     "register_own_messages",
     "run_experiment",
-    "run_time",
 ]
 
 if not TYPE_CHECKING:
@@ -49,5 +47,4 @@ if not TYPE_CHECKING:
             "afspm.supervisor.run": "RunOptions dry_run",
         },
         run_experiment="afspm.supervisor.run.run",
-        run_time="afspm.supervisor.run.now",
     )

@@ -8,7 +8,6 @@ import sqlite3
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
-from datetime import datetime
 from pathlib import Path
 from typing import TextIO
 
@@ -113,7 +112,7 @@ def run(experiment: Experiment, options: RunOptions = RunOptions(), terminal: Te
     require_free(addresses_of(first))
     require_limits(len(first))
     common = common_identity(experiment, first, own, options, terminal)
-    folder = run_folder.create(options.runs, experiment.name, now())
+    folder = run_folder.create(options.runs, experiment.name, run_folder.now())
     with lock_run(folder):
         with writing_to(folder):
             run_folder.write_experiment(folder, experiment.expanded(secrets=False))
@@ -365,11 +364,6 @@ def _require_real_time(clock: ExperimentClock, experiment: Experiment) -> None:
             where="[clock]",
             hint="start the translator together with its emulator, or set the speed to 1",
         )
-
-
-def now() -> datetime:
-    """Return real time, in this computer's time zone."""
-    return datetime.fromtimestamp(ExperimentClock.real().now_s()).astimezone()
 
 
 def _child_policy(experiment: Experiment) -> ChildPolicy:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
+from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import FileError
 from afspm.record.run_json import EXPERIMENT_FILE, LATEST_FILE, LATEST_LINK, RUN_FILE, STATE_DIR
 from afspm.storage.atomic import replace_file
@@ -40,6 +41,11 @@ def create(runs: Path, experiment: str, started: datetime) -> Path:
             hint="choose another with --runs",
         ) from error
     return folder
+
+
+def now() -> datetime:
+    """Return real time, in this computer's time zone."""
+    return datetime.fromtimestamp(ExperimentClock.real().now_s()).astimezone()
 
 
 def write_run(folder: Path, facts: Mapping[str, object]) -> None:

@@ -17,7 +17,7 @@ from afspm.model import Frame
 from afspm.night import RecordPlayback
 from afspm.plugins.replay.replayer import Replayer
 from afspm.record import ENDED, EXPERIMENT_FILE, REPLAY_OF, STATE_DIR, lock_run
-from afspm.supervisor import FreePorts, run_folder, run_time
+from afspm.supervisor import FreePorts, run_folder
 from afspm.transport import RateLimitedLog, is_local
 from afspm.transport.process import signals
 
@@ -119,7 +119,7 @@ def _guest(run: Run) -> Launch:
 
 @contextmanager
 def _folder(run: Run, runs: Path, guest: Launch, clock: ExperimentClock, publish: str, serve: str) -> Iterator[Path]:
-    folder = run_folder.create(runs, f"replay-{run.folder.name}", run_time())
+    folder = run_folder.create(runs, f"replay-{run.folder.name}", run_folder.now())
     sockets = Sockets(subscribe=(publish,), control=serve)
     joined = replace(
         guest,
