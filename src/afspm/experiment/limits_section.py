@@ -47,12 +47,12 @@ from afspm.experiment.toml_lines import Table
 from afspm.experiment.validation_messages import name_of, report
 from afspm.model import Parameter, Region, component_of, names
 from afspm.model.bias import BiasReference
-from afspm.model.instruments import instrument_of
+from afspm.model.instruments import instrument_of, split
 from afspm.scheduler import ExperimentLimits
 from afspm.scheduler.safety import rule_language
 from afspm.scheduler.safety.forbidden_states import NEVER_REFUSED, STATES
 from afspm.scheduler.safety.limits import ForbiddenState, Limit, RoleLimits, bounds, limit_key
-from afspm.scheduler.safety.rule_language import RuleComparison, RuleError, RuleTree
+from afspm.scheduler.safety.rule_language import RuleComparison, RuleError, RuleSwitch, RuleTree
 
 Quantity = str | float
 _QUANTITIES: Final = ("min", "max", "step", "rate")
@@ -274,8 +274,8 @@ class LimitsReader:
             return None
         try:
             tree = rule_language.parse(rule)
-            has_alias = any(names.BIAS_OF_SAMPLE in one.names for one in rule_language.atoms(tree))
-            if has_alias and (refused := self._refuses_alias())[0]:
+            alias = {names.BIAS_OF_SAMPLE, rule_language.change_of(names.BIAS_OF_SAMPLE)}
+            if any(alias & one.names for one in rule_language.atoms(tree)) and (refused := self._refuses_alias())[0]:
                 raise RuleError(refused[0], rule.index(names.BIAS_OF_SAMPLE), refused[1])
             state = ForbiddenState(rule, source=str(self.document.place(*path)), bias_sign=self.bias.sign)
             return replace(state, units=self._units_of(state.tree))
@@ -296,6 +296,8 @@ class LimitsReader:
         for atom in rule_language.atoms(tree):
             if isinstance(atom, RuleComparison):
                 self._compare(atom, units)
+            elif changed := rule_language.changed_name(atom.name):
+                self._check_change(atom, changed)
             elif atom.name not in STATES and (kind := self._type_of(atom.name, atom.at)) != "bool":
                 if kind == "text":
                     raise RuleError(f"{atom.name} is a text, which no rule can judge", atom.at)
@@ -303,10 +305,19 @@ class LimitsReader:
                 raise RuleError(f"{atom.name} is a number, and is compared with nothing", atom.at, hint)
         return units
 
+    def _check_change(self, atom: RuleSwitch, name: str) -> None:
+        if not atom.on:
+            raise RuleError("a change can't be denied", atom.at, f"changes({name}) is off unless a request changes it")
+        if name in NEVER_REFUSED:
+            raise RuleError(f"{name} makes the tip safe or stops a measurement, and is never refused", atom.at)
+        if name not in self._known_actions:
+            self._type_of(name, atom.at)
+
     def _compare(self, atom: RuleComparison, units: dict[str, str]) -> None:
         terms = (atom.left, atom.right)
         for name, at in ((name, term.at) for term in terms for name in term.names):
-            kind = "bool" if name in STATES else self._type_of(name, at)
+            is_switch = name in STATES or rule_language.changed_name(name)
+            kind = "bool" if is_switch else self._type_of(name, at)
             if kind == "text":
                 raise RuleError(f"{name} is a text, which no rule can judge", at)
             if kind:
@@ -331,6 +342,9 @@ class LimitsReader:
     def _type_of(self, name: str, at: int) -> str:
         # empty for a number
         known = self._known_parameters
+        of_instrument, part = split(name)
+        if part == "busy" and of_instrument in known:
+            return "bool"
         if name in known or (not self.certain and name.startswith("x-")):
             return self.types.get(name, _TYPES.get(name, ""))
         hint = nearest(name, [*known, *STATES])

@@ -71,22 +71,27 @@ def served() -> Iterator[int]:
         server.shutdown()
 
 
+@contextmanager
+def running(folder: Path, text: str) -> Iterator[afspm.Scope]:
+    """Run an experiment, and end it after the block."""
+    (folder / "experiment.toml").write_text(text, encoding="utf-8")
+    command = [sys.executable, "-m", "afspm", "run", "experiment.toml"]
+    with (folder / "run.txt").open("wb") as log:
+        run = subprocess.Popen(command, cwd=folder, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+    until_s = time.monotonic() + DEADLINE_S
+    while not list(folder.glob("runs/*/run.json")):
+        assert time.monotonic() < until_s, (folder / "run.txt").read_text(encoding="utf-8")
+        time.sleep(0.1)
+    with afspm.connect(folder / "runs") as made:
+        yield made
+        made.end_experiment()
+    run.wait(DEADLINE_S)
+
+
 @pytest.fixture
 def scope(tmp_path: Path) -> Iterator[afspm.Scope]:
-    with served() as port:
-        text = EXPERIMENT.replace("PORT", str(port))
-        (tmp_path / "experiment.toml").write_text(text, encoding="utf-8")
-        command = [sys.executable, "-m", "afspm", "run", "experiment.toml"]
-        with (tmp_path / "run.txt").open("wb") as log:
-            run = subprocess.Popen(command, cwd=tmp_path, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
-        until_s = time.monotonic() + DEADLINE_S
-        while not list(tmp_path.glob("runs/*/run.json")):
-            assert time.monotonic() < until_s, (tmp_path / "run.txt").read_text(encoding="utf-8")
-            time.sleep(0.1)
-        with afspm.connect(tmp_path / "runs") as made:
-            yield made
-            made.end_experiment()
-        run.wait(DEADLINE_S)
+    with served() as port, running(tmp_path, EXPERIMENT.replace("PORT", str(port))) as made:
+        yield made
 
 
 def measured(scope: afspm.Scope, parameter: str) -> float:

@@ -214,3 +214,40 @@ def test_person_who_sets_a_forbidden_state_keeps_the_microscope() -> None:
     assert lab.core.control.mode is ControlMode.MANUAL
     outside = lab.core.state.panel.outside
     assert "tip-bias-voltage = 3 V and zctrl-setpoint = 1 nA is a forbidden state" in outside[BIAS]
+
+
+STAGE = "changes(lab.stage-x) and x-engaged"
+
+
+def test_request_that_moves_a_stage_is_refused_while_the_tip_is_at_the_sample() -> None:
+    rule = limits(STAGE)
+    why = refusal(rule, set_("lab.stage-x", "3", "mm"), present(x_engaged="true"))
+    assert why == (
+        "a change of lab.stage-x is forbidden while x-engaged = true: changes(lab.stage-x) and x-engaged (night.toml:7)"
+        "; first withdraw the tip (x-retract)"
+    )
+    assert not refusal(rule, set_("lab.stage-x", "3", "mm"), present(x_engaged="false"))
+    assert "a value is unknown: x-engaged" in refusal(rule, set_("lab.stage-x", "3", "mm"), PresentState())
+    assert not refusal(rule, set_(BIAS, "3", "V"), present(x_engaged="true"))
+    assert not refusal(rule, Request(int(ControlRequest.PARAM), Parameter("lab.stage-x")), present(x_engaged="true"))
+    assert not refusal(rule, action("start-scan"), present(ScopeState.FREE, x_engaged="true"))
+
+
+def test_action_of_the_maker_is_named_in_a_rule() -> None:
+    rule = limits("changes(COARSE_STEP) and x-engaged")
+    assert refusal(rule, action("COARSE_STEP"), present(x_engaged="true"))
+    assert not refusal(rule, action("COARSE_STEP"), present(x_engaged="false"))
+    assert not refusal(rule, action("start-scan"), present(ScopeState.FREE, x_engaged="true"))
+
+
+def test_action_changes_what_its_command_sets() -> None:
+    step = ExperimentLimits(
+        forbid=limits("changes(x-steps) and x-engaged").forbid, sets={"STEP": (Parameter("x-steps", "5"),)}
+    )
+    assert refusal(step, action("STEP"), present(x_engaged="true"))
+
+
+def test_change_of_the_sample_bias_is_a_change_at_the_panel() -> None:
+    rule = ForbiddenState("changes(sample-bias) and SCANNING", {}, bias_sign=-1.0)
+    both = ExperimentLimits(forbid={"": rule})
+    assert refusal(both, set_(BIAS, "1", "V"), present(ScopeState.SCANNING))

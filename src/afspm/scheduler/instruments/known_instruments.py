@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from afspm.basics.frozen import replace
 from afspm.model import ControlResponse, InstrumentOrder, InstrumentReading, InstrumentReadings, OrderOutcome, Parameter
-from afspm.model.instruments import GivenOrder, instrument_of
+from afspm.model.instruments import GivenOrder, instrument_of, split
 from afspm.scheduler.events import RequestIn
 from afspm.scheduler.instruments.conditions import OLDEST_S, ConditionState, InstrumentSettings, MeasuringCondition
 from afspm.scheduler.requests.forwarder import ForwardedRequest
@@ -123,6 +123,13 @@ class Instruments:
         Returns:
             The reason, if they are unknown.
         """
+        name, part = split(parameter)
+        if part == "busy":
+            reading = self.reading(name, now_s)
+            if reading.value is None:
+                return reading.reason or "it has no value"
+            is_busy = reading.busy or any(order.parameter == name for order in self.given)
+            return (Parameter(parameter, "true" if is_busy else "false"),)
         reading = self.reading(parameter, now_s)
         if reading.value is None:
             return reading.reason or "it has no value"

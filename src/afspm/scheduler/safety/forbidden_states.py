@@ -5,6 +5,7 @@ Three requests are never refused: one that ends the forbidden state, one that mo
 (`NEVER_REFUSED`). A request moves away if it makes no comparison of the rule truer, and at least one less true. A rule
 has only `and` and `or`, so such a request can't begin a forbidden state, for any unknown values. A request
 that changes no value of a rule is not judged by it, unless it is an action: nothing begins in a forbidden state.
+A request itself is a value, too: `changes(lab.stage-x)` is on while a request is judged that moves the stage.
 
 The caller collects the values before the request (`PresentState`). One value may have several candidates: an instrument
 on its way to a target counts at both ends, and a scan counts from its start, before its state is published.
@@ -70,6 +71,9 @@ def changed_by(limits: ExperimentLimits, request: Request) -> dict[str, Paramete
             changed.update({name: value for name, (value,) in in_states([state]).items()})
     for subject in subjects:
         changed.update(values_in(subject))
+    acts = [name for name in changed if name not in STATES]
+    acts += [str(request.subject)] if request.kind == ControlRequest.ACTION else []
+    changed.update({switch: Parameter(switch, "true") for switch in map(rule_language.change_of, acts)})
     return changed
 
 
@@ -100,7 +104,8 @@ def judging(limits: ExperimentLimits, request: Request) -> list[ForbiddenState]:
 
 def to_read(rules: Collection[ForbiddenState]) -> list[str]:
     """Return the parameters of the microscope in rules; instruments report theirs, and states are published."""
-    known = {name for rule in rules for name in rule.names if name not in STATES}
+    names_in_rules = {name for rule in rules for name in rule.names}
+    known = {name for name in names_in_rules if name not in STATES and not rule_language.changed_name(name)}
     return sorted(name for name in known if not instrument_of(name) or name.startswith("x-"))
 
 
@@ -200,7 +205,8 @@ class _Decision:
 
     def _sentence(self, after: Known) -> str:
         is_action = self.request.kind == ControlRequest.ACTION
-        changed = [name for name in self.settings if name not in STATES]
+        acts = {rule_language.changed_name(name) for name in self.settings}
+        changed = [name for name in self.settings if name not in STATES and name not in acts]
         what = [str(self.request.subject)] if is_action else _texts(self.rule, after, changed)
         others = _texts(self.rule, after, self.rule.names - self.settings.keys())
         meanwhile = f" while {' and '.join(others)}" if others else ""
@@ -233,7 +239,9 @@ class _Decision:
 
 def _combinations(rule: ForbiddenState, present: PresentState) -> Iterator[Known]:
     candidates = {
-        name: tuple(_value(rule, parameter) for parameter in present.values.get(name, ())) or (None,)
+        name: (False,)
+        if rule_language.changed_name(name)
+        else tuple(_value(rule, parameter) for parameter in present.values.get(name, ())) or (None,)
         for name in sorted(rule.names)
     }
     if math.prod(map(len, candidates.values())) > _MOST_COMBINATIONS:
@@ -261,6 +269,8 @@ def _texts(rule: ForbiddenState, known: Known, wanted: Collection[str]) -> list[
             continue
         if name in rule.units:
             texts.append(f"{name} = {quantity(float(value), rule.units[name], 6)}")
+        elif changed := rule_language.changed_name(name):
+            texts.append(f"a change of {changed}")
         elif name in STATES:
             texts.append(f"the microscope is {'' if value else 'not '}{name}")
         else:
@@ -270,6 +280,8 @@ def _texts(rule: ForbiddenState, known: Known, wanted: Collection[str]) -> list[
 
 def _cure(atom: RuleAtom) -> str:
     if not isinstance(atom, RuleComparison):
+        if atom.name == names.ENGAGED and atom.on:
+            return f"withdraw the tip ({names.RETRACT})"
         if atom.name in STATES:
             return f"wait until the microscope is {'not ' if atom.on else ''}{atom.name}"
         return f"set {atom.name} to {'false' if atom.on else 'true'}"

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from afspm.model import Parameter, Request
 from afspm.model.instruments import instrument_of
+from afspm.scheduler.safety import rule_language
 from afspm.scheduler.safety.forbidden_states import STATES, PresentState, in_states, judging
 from afspm.scheduler.state import StateDraft
 
@@ -24,6 +25,8 @@ def present_state(draft: StateDraft, read: Mapping[str, Parameter | None]) -> Pr
     if states:
         values |= in_states(states)
     for name in wanted - values.keys():
+        if rule_language.changed_name(name):
+            continue
         if name in STATES:
             unknown[name] = "the microscope has not reported its state"
         elif draft.instruments.owns(name):

@@ -7,6 +7,7 @@
 | comparison | two terms with `<`, `<=`, `>` or `>=`; at least one is a quantity |
 | term | a name, `abs(name)`, `abs(name - name)`, or a number with its unit |
 | switch | a name alone: a switch of the microscope (`x-feedback-on`), or its state (`SCANNING`) |
+| act | `changes(name)`: true while a request is judged that sets this parameter or begins this action |
 
 There is no equality: controllers round. `parse` moves every `not` into the comparisons, so that a tree has only `and`
 and `or`. Then a state in which no comparison is truer is not worse, which `ForbiddenState` relies on.
@@ -32,7 +33,7 @@ BORDER: Final = 1e-6
 """Relative distance within which a value lies on its bound: controllers round, some to single precision."""
 _LONGEST, _DEEPEST = 1000, 20  # characters, and nested brackets: the parser calls itself for each
 _OPPOSITE: Final = {"<": ">=", "<=": ">", ">": "<=", ">=": "<"}
-_WORDS = frozenset({"and", "or", "not", "abs"})
+_WORDS = frozenset({"and", "or", "not", "abs", "changes"})
 _TOKEN = re.compile(
     r"(?P<space>\s+)|(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)|(?P<sign><=|>=|[<>])|(?P<bracket>[()])"
     r"|(?P<word>[^\s()<>=!&|\d,;\"'][^\s()<>=!&|,;\"']*)"
@@ -170,6 +171,16 @@ class RuleJunction:
 RuleTree = RuleAtom | RuleJunction
 
 
+def change_of(name: str) -> str:
+    """Return the switch of a rule that is on while a request changes a parameter, or begins an action."""
+    return f"changes({name})"
+
+
+def changed_name(switch: str) -> str:
+    """Return the parameter or action of a `change_of`; empty for another switch."""
+    return switch.removeprefix("changes(")[:-1] if switch.startswith("changes(") else ""
+
+
 def atoms(tree: RuleTree) -> Iterator[RuleAtom]:
     """Yield the comparisons and switches of a rule, from left to right."""
     if isinstance(tree, RuleJunction):
@@ -185,7 +196,8 @@ def renamed(tree: RuleTree, old: str, new: str, sign: float) -> RuleTree:
         case RuleJunction():
             return replace(tree, parts=tuple(renamed(part, old, new, sign) for part in tree.parts))
         case RuleSwitch():
-            return replace(tree, name=new) if tree.name == old else tree
+            found = {old: new, change_of(old): change_of(new)}
+            return replace(tree, name=found.get(tree.name, tree.name))
     return replace(tree, left=tree.left.renamed(old, new, sign), right=tree.right.renamed(old, new, sign))
 
 
@@ -297,6 +309,11 @@ class _Parser:
                 minus = self._quantity().text
             self._require(")")
             return RuleTerm(name.text, absolute=True, minus=minus, at=name.at)
+        if token.text == "changes":
+            self._require("(")
+            name = self._quantity()
+            self._require(")")
+            return RuleTerm(change_of(name.text), at=name.at)
         if token.kind != "word" or token.text in _WORDS:
             raise self._unexpected("a name or a number", token)
         return RuleTerm(token.text, at=token.at)
