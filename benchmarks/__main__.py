@@ -33,6 +33,7 @@ MODULES = (
     "translator",
     "controllers",
     "dead_time",
+    "sweep_at",
     "reading",
     "recording",
     "experiment",
