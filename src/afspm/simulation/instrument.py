@@ -48,6 +48,7 @@ from afspm.simulation.world import World
 
 Doing = ScanActivity | SpectrumActivity | Occupied
 _MOST_AVERAGED = 32  # more sweeps reduce the noise no further
+_PRESSED_M_PER_S = 10e-9  # by a ramp or a feedback, of a tip that meets the sample
 _FASTEST_DRIFT_M_S = 1e-6
 _FEW = (2, 2)  # pixels: enough to find the channels
 _STATE_VERSION = 2
@@ -424,10 +425,35 @@ class SimulatedInstrument:
         else:
             self.world.compensate(velocity_m_per_s, now_s)
 
-    def hold(self, z_m: float) -> None:
-        """Set z while the feedback is off. Raises InvalidValue."""
+    def hold(self, z_m: float, now_s: float | None = None) -> None:
+        """Set z while the feedback is off; with a time, a tip that this drives into the sample crashes.
+
+        Raises:
+            InvalidValue: z is not finite.
+        """
         self.drawing.wait()
         self.world.hold(z_m)
+        if now_s is not None:
+            self.press(now_s)
+
+    def z_m(self, now_s: float) -> float:
+        """Return z of the resting tip, as the controller sets it: without noise."""
+        self.drawing.wait()
+        setup = self.setup
+        return self.world.z_m(self.probe_at(now_s), now_s, setup.feedback, setup.bias_v, slope=setup.slope)
+
+    def press(self, now_s: float) -> None:
+        """Let a resting tip crash that the present settings drive into the sample."""
+        if not self.engaged or self.doing(now_s):
+            return
+        self.drawing.wait()
+        setup, position_m = self.setup, self.probe_at(now_s)
+        try:
+            depth_m = self.world.pressed_m(position_m, now_s, setup.feedback, setup.bias_v, slope=setup.slope)
+        except InvalidValue:  # with an invalid feedback the tip meets no surface
+            return
+        if depth_m > 0.0:
+            self._crashed(depth_m, _PRESSED_M_PER_S, now_s, position_m)
 
     def switch_feedback(self, now_s: float, *, on: bool) -> None:
         """Switch the feedback on or off, and count the time up to now in the ledger.
@@ -440,6 +466,7 @@ class SimulatedInstrument:
             self._remember(now_s)
         self.setup.feedback = replace(self.setup.feedback, on=on)
         self.note_changes(now_s)
+        self.press(now_s)
 
     def is_held(self, now_s: float) -> bool:
         """Return whether the controller holds the feedback, in a spectrum or after it, and will give it back."""
@@ -503,17 +530,19 @@ class SimulatedInstrument:
         if not min(depth_m, speed_m_s) > 0.0:
             raise InvalidValue(f"a crash {depth_m} m deep with {speed_m_s} m/s", hint="depth and speed must be above 0")
         self._check_free(now_s)
-        outcome, position_m = "unchanged", self._probe_m
-        if self.engaged:
-            marks = len(self.world.sample.marks)
-            outcome = self.world.crash(position_m, depth_m, speed_m_s, now_s)
-            facts = {"position_m": position_m, "speed_m_per_s": speed_m_s, "depth_m": depth_m, "outcome": outcome}
-            clearance_m = self.damage.clearance_m(position_m, now_s)
-            self.note(now_s, "crash", {**facts, "clearance_m": clearance_m})
-            near, radius_m = self.damage.is_near(clearance_m), self._mark_radius_m(marks)
-            ledger = self.ledger.crashed(depth_m, outcome, radius_m, near=near)
-            self._add_damage(now_s, "crash", ledger)
+        outcome = self._crashed(depth_m, speed_m_s, now_s, self._probe_m) if self.engaged else "unchanged"
         self.occupy("crash", 2.0 * depth_m / speed_m_s, now_s)
+        return outcome
+
+    def _crashed(self, depth_m: float, speed_m_s: float, now_s: float, position_m: tuple[float, float]) -> str:
+        marks = len(self.world.sample.marks)
+        outcome = self.world.crash(position_m, depth_m, speed_m_s, now_s)
+        facts = {"position_m": position_m, "speed_m_per_s": speed_m_s, "depth_m": depth_m, "outcome": outcome}
+        clearance_m = self.damage.clearance_m(position_m, now_s)
+        self.note(now_s, "crash", {**facts, "clearance_m": clearance_m})
+        near, radius_m = self.damage.is_near(clearance_m), self._mark_radius_m(marks)
+        ledger = self.ledger.crashed(depth_m, outcome, radius_m, near=near)
+        self._add_damage(now_s, "crash", ledger)
         return outcome
 
     def engage(self, now_s: float) -> None:

@@ -158,6 +158,7 @@ def _named_scanner(tables: dict[str, object], errors: ErrorCollector) -> Mapping
 
 STATE_VERSION = 4
 _POINT_M = 1e-12
+_DRIVEN_IN_M = 1e-9
 _SAME_PLACE_M = 20e-12
 _FIRST_BIAS_V = 0.1
 
@@ -331,6 +332,46 @@ class World:
     def _hold_conditions(self, loop: Loop, bias_v: float) -> None:
         if loop.on:
             self._held = replace(self._held, setpoint=loop.setpoint, bias_v=bias_v)
+
+    def z_m(
+        self,
+        position_m: tuple[float, float],
+        t_s: float,
+        feedback: Feedback,
+        bias_v: float,
+        *,
+        slope: tuple[float, float] = (0.0, 0.0),
+    ) -> float:
+        """Return z of a resting tip, as the controller sets it: without noise. Raises as `at_rest`."""
+        setup = self._setup(Loop.of(self.settings.feedback, feedback), bias_v, slope, t_s)
+        course, _, felt = self._felt(position_m, t_s, setup)
+        return self._scales[2] * rest_z_m(course, felt, setup)
+
+    def pressed_m(
+        self,
+        position_m: tuple[float, float],
+        t_s: float,
+        feedback: Feedback,
+        bias_v: float,
+        *,
+        slope: tuple[float, float] = (0.0, 0.0),
+    ) -> float:
+        """Return how deep these settings drive a resting tip into the sample, in m; 0 or below: it does not touch.
+
+        A feedback that needs more than the conductance of a one-atom contact for its setpoint never stops: it is
+        taken to drive the tip in by 1 nm. Raises InvalidValue for an invalid feedback.
+        """
+        setup = self._setup(Loop.of(self.settings.feedback, feedback), bias_v, slope, t_s)
+        loop, settings = setup.loop, self.settings.feedback
+        if settings.mode == "current":
+            away_m = loop.tunnelling_distance_m(bias_v if setup.set_bias_v is None else setup.set_bias_v)
+        elif settings.mode == "frequency-shift":
+            away_m = settings.sensor.distance_m(loop.setpoint) - settings.sensor.contact_m
+        else:
+            away_m = loop.setpoint * settings.sensitivity_m_per_v
+        if loop.on:
+            return 0.0 if away_m > 0.0 else _DRIVEN_IN_M
+        return -(self._gap_m(position_m, t_s, setup) + away_m)
 
     def hold(self, z_m: float) -> None:
         """Set z while the feedback is off.

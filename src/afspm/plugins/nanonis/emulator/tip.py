@@ -58,7 +58,7 @@ class ZController:
         z_m = float(np.mean([self._signals.z_m(now_s) for _ in range(_Z_AVERAGED)])) if lifts and lift_m else 0.0
         rig.switch_feedback(now_s, on=on)
         if z_m:
-            rig.hold(z_m + lift_m)
+            rig.hold(z_m + lift_m, now_s)
         if on:
             rig.engaged = True
 
@@ -96,7 +96,7 @@ class ZController:
     def _set_position(self, z_m: float) -> Answer:
         if self.state == "on":
             raise FunctionRefused("the Z-Controller is on")
-        self._core.rig.hold(z_m)
+        self._core.rig.hold(z_m, self._core.now_s)
         return ()
 
     @answers("ZCtrl.ZPosGet")
@@ -109,7 +109,7 @@ class ZController:
         relative, home_m = (*self._core.registers.get("ZCtrl.HomeProps"), 0, 0.0)[:2]
         z_m = self._signals.z_m(self._core.now_s)
         self.switch(self._core.now_s, on=False)
-        self._core.rig.hold(home_m + (z_m if relative else 0.0))
+        self._core.rig.hold(home_m + (z_m if relative else 0.0), self._core.now_s)
         return ()
 
     @answers("ZCtrl.SetpntSet")
