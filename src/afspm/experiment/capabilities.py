@@ -76,6 +76,8 @@ def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None
     marks = (getattr(getattr(acting, name), "_afspm_action", None) for name in dir(acting))
     added = settings.get("actions") or {}
     actions = {mark.name for mark in marks if mark is not None} | set(added)
+    if acting.holds_z():
+        actions |= {*names.OF_HELD_Z_ACTIONS}
     try:
         channels = microscope.channels_of(settings)
         table = microscope.parameter_table(microscope.rows(settings))
@@ -128,6 +130,7 @@ def base() -> dict[str, str | None]:
         names.CRASH_DEPTH: "m",
         names.SPEC_KIND: None,
         **names.OF_CURVES,
+        **names.OF_HELD_Z,
         # without a unit at most makers; a limit with another one is an error, rather than never compared
         **dict.fromkeys((names.ZCTRL_PGAIN, names.ZCTRL_IGAIN), ""),
     }

@@ -128,7 +128,8 @@ class LimitsReader:
 
     @property
     def _known_actions(self) -> frozenset[str]:
-        return frozenset((*names.BASE_ACTIONS, *names.EXTENSION_ACTIONS)) if self.actions is None else self.actions
+        known = (*names.BASE_ACTIONS, *names.EXTENSION_ACTIONS, *names.OF_HELD_Z_ACTIONS)
+        return frozenset(known) if self.actions is None else self.actions
 
     def read(self, table: Table) -> ExperimentLimits:
         """Return the limits; after errors, which are reported, entries may be missing or empty."""

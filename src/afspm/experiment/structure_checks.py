@@ -527,6 +527,8 @@ def check_needs(resolved: ResolvedExperiment) -> None:
                 for missing in [name for name in needed if name not in known]:
                     what = f"[{name}] needs the {kind} {missing!r}, which [{translator.name}] does not have"
                     hint = has.bias.unknown if missing == names.BIAS_OF_SAMPLE else nearest(missing, offered)
+                    if missing in names.OF_HELD_Z_ACTIONS:
+                        hint = str(getattr(translator.component, "cant_hold_z", hint))
                     resolved.document.error(what, name, hint=hint)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 from afspm.basics.frozen import replace
-from afspm.model import Feedback, Parameter, Request, ScopeState, names
+from afspm.model import ControlRequest, Feedback, Parameter, Request, ScopeState, names
 
 FEEDBACK_OFF = "feedback-off"
 """The name in `dangerous` for a feedback that is known to be off."""
@@ -25,11 +25,13 @@ class TipRisk:
         state: the last known state, which lasts even after the loss of the controller.
         feedback_on: None if unknown.
         tip_away: whether the tip is withdrawn, so that neither the coarse motor nor a switched-off feedback does harm.
+        holds_z: whether the holder has asked to hold z, and its way back was not asked for yet.
     """
 
     state: ScopeState = ScopeState.UNDEFINED
     feedback_on: bool | None = None
     tip_away: bool = False
+    holds_z: bool = False
 
     @property
     def has_no_feedback(self) -> bool:
@@ -128,7 +130,12 @@ class MicroscopeStatus:
         """Return the status after a possibly executed action; all but starts and stops may move the tip."""
         # to start or stop a scan or spectrum neither engages nor withdraws the tip
         only_runs = action in STARTS or action in STOPS.values()
-        return self if only_runs else self.with_tip(away=is_away)
+        return self if only_runs else self.with_tip(away=is_away).holding_z(action)
+
+    def holding_z(self, action: str) -> MicroscopeStatus:
+        """Return the status after an action that may hold z, or end that."""
+        holds = {names.HOLD_Z: True, names.RELEASE_Z: False}.get(action, self.risk.holds_z)
+        return self._with_risk(replace(self.risk, holds_z=holds))
 
     @property
     def endangered_by_feedback(self) -> bool:
@@ -155,8 +162,13 @@ class MicroscopeStatus:
 
 
 def feedback_of(request: Request) -> Feedback | None:
-    """Return the feedback that a request sets; None if it sets none."""
+    """Return the feedback that a request sets; None if it sets none.
+
+    The way back of a held z sets none: it switches the feedback on later, if all of it succeeds.
+    """
     subject = request.subject
+    if request.kind == ControlRequest.ACTION and subject == names.HOLD_Z:
+        return Feedback(on=False)
     if isinstance(subject, Parameter) and subject.name == names.FEEDBACK_ON and subject.value is not None:
         return Feedback(on=subject.value.strip().lower() not in _OFF)
     return subject if isinstance(subject, Feedback) else None

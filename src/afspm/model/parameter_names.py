@@ -20,7 +20,13 @@ ENGAGE: Final = "x-engage"
 FEEDBACK_MAY_BE_OFF: Final = "x-feedback-may-be-off"
 """A person says that the z feedback is off by intention; every translator takes it, in the mode MANUAL alone."""
 
+HOLD_Z: Final = "x-hold-z"
+"""Switch the z feedback off to hold z; every translator takes it whose driver can move z then."""
+RELEASE_Z: Final = "x-release-z"
+"""The way back from `HOLD_Z`: height, bias, setpoint and gains as before it, then the feedback on."""
+
 EXTENSION_ACTIONS: Final = (PULSE, CRASH, RETRACT, ENGAGE)
+OF_HELD_Z_ACTIONS: Final = (HOLD_Z, RELEASE_Z)
 
 TREATMENTS: Final = (PULSE, CRASH)
 AT_PROBE: Final = frozenset({START_SPEC, *TREATMENTS})
@@ -109,6 +115,29 @@ OF_CURVES: Final = {
 SWEEPS_BIAS: Final = frozenset({"IV"})
 SWEEPS_HEIGHT: Final = frozenset({"force", "z"})
 """Kinds of curves by the swept quantity; others, such as a maker's vector programs, may sweep any."""
+
+# A held z: the height of a tip whose feedback is off.
+HELD_Z_OFFSET: Final = "x-held-z-offset"
+"""Height above the height of the setpoint, negative towards the sample: while z is held, a setting moves the tip."""
+HELD_Z_SPEED: Final = "x-held-z-speed"
+HELD_Z_ABORT_CURRENT: Final = "x-held-z-abort-current"
+"""Absolute current beyond which z is held no more; 0: none."""
+HELD_Z_ABORT_SHIFT: Final = "x-held-z-abort-shift"
+"""Absolute frequency shift beyond which z is held no more; 0: none."""
+Z_IS_HELD: Final = "x-z-is-held"
+"""Whether z is held, and not on its way back; read-only."""
+OF_HELD_Z: Final = {
+    HELD_Z_OFFSET: "m",
+    HELD_Z_SPEED: "m/s",
+    HELD_Z_ABORT_CURRENT: "A",
+    HELD_Z_ABORT_SHIFT: "Hz",
+}
+"""The parameters of a held z with their SI units."""
+TIP_Z: Final = "x-tip-z"
+"""Height of the tip as measured, positive away from the sample; read-only."""
+CURRENT: Final = "x-current"
+FREQUENCY_SHIFT: Final = "x-frequency-shift"
+"""Current and frequency shift as measured now; read-only."""
 
 FEEDBACK_ON: Final = "x-feedback-on"
 ON_WORDS: Final = frozenset({"true", "1", "on", "yes"})

@@ -79,6 +79,7 @@ class Commands:
         self._contended = 0
         driver.for_a_while = temporary.begin
         self.actions = driver.own_actions() | self._added_actions(driver.common.actions)
+        self.actions |= temporary.held.actions()
         if names.FEEDBACK_ON in driver.table and not driver.only_reads:
             self.actions[names.FEEDBACK_MAY_BE_OFF] = Action(names.FEEDBACK_MAY_BE_OFF, panel.may_be_off)
 
@@ -132,10 +133,14 @@ class Commands:
 
     def _set(self, request: Request, values: Mapping[str, Value]) -> CommandOutcome:
         driver = self._driver
+        self._temporary.held.refuse_setting(values)
         self._refuse_if_busy(all(name in driver.adjustable or driver.table[name].while_busy for name in values))
         read_back = self._apply(values, lambda: self._about_to_act(request)) if values else {}
         self._is_set({name: read_back[name] for name in values})
-        steps = self._sequence.begin(ScopeState.MOVING) if MOVES & values.keys() else []
+        if MOVES & values.keys():
+            self._temporary.held.moves_aside()
+        moves = bool(MOVES & values.keys()) or (names.HELD_Z_OFFSET in values and self._temporary.held.is_held)
+        steps = self._sequence.begin(ScopeState.MOVING) if moves else []
         done = self._success(request, read_back)
         done.steps = steps
         if request.kind == ControlRequest.PARAM:
@@ -164,10 +169,12 @@ class Commands:
         if action.only_stops and state not in action.interrupts:
             return done
         self._refuse_if_busy(action.while_busy)
-        treatment = self._temporary.treatment
+        treatment, held = self._temporary.treatment, self._temporary.held
+        held.refuse(action.name)
         if action.name in STARTS:
             self._refuse_without_tip()
             treatment.refuse_start()
+            held.moves_aside()
         if action.needs_withdrawn:
             self._refuse_at_sample()
         treatment.forget()  # of a treatment that this action ends
@@ -221,6 +228,8 @@ class Commands:
             raise Refused(ControlResponse.ACTION_ERROR, "the tip is at the sample: withdraw it first (x-retract)")
 
     def _find_action(self, name: str) -> Action:
+        if name in names.OF_HELD_Z_ACTIONS and name not in self.actions:
+            raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, f"z can't be held: {self._driver.cant_hold_z}")
         if name not in self.actions:
             # the name comes from a peer, and may be of any length
             near = difflib.get_close_matches(name[:100], self.actions, n=1)

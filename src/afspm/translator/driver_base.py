@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, Protocol, TypeVar
+from typing import Any, ClassVar, Final, Literal, Protocol, TypeVar
 
 from afspm.basics.clock import Clock
 from afspm.basics.errors import AfspmError, ConfigError, ErrorCollector, InvalidValue, Refused
@@ -23,7 +23,7 @@ from afspm.model.variables import VariableRoles
 from afspm.translator.judge import WITNESSES, Stated
 from afspm.translator.parameters import ParameterSpec, ParameterTable, Value
 from afspm.translator.polling import EAGER_S
-from afspm.translator.setting_groups import SettingsGroup, reach_in
+from afspm.translator.setting_groups import HeldZSettings, SettingsGroup, reach_in
 
 T = TypeVar("T")
 
@@ -80,6 +80,15 @@ class Action:
     def only_stops(self) -> bool:
         """True if the action does nothing unless its measurement is running."""
         return self.name in (names.STOP_SCAN, names.STOP_SPEC)
+
+
+_HELD_Z_ROWS: Final[Mapping[str, Mapping[str, object]]] = {
+    names.HELD_Z_OFFSET: {"unit": "m", "range": ["-10 nm", "1 um"]},
+    names.HELD_Z_SPEED: {"unit": "m/s", "range": ["1 pm/s", "100 nm/s"]},
+    names.HELD_Z_ABORT_CURRENT: {"unit": "A", "range": [0, "1 mA"]},
+    names.HELD_Z_ABORT_SHIFT: {"unit": "Hz", "range": [0, "1 MHz"]},
+    names.Z_IS_HELD: {"type": "bool", "read_only": True},
+}
 
 
 def _not_implemented() -> None:
@@ -272,6 +281,9 @@ class DriverBase(ABC):
     """Experiment seconds after a scan in which a moved tip is no act by hand, for a controller that shows late where a
     scan has left the tip."""
 
+    cant_hold_z: ClassVar[str] = "its driver knows no documented function that sets z while the feedback is off"
+    """Why z can't be held, where `move_z` is not overridden."""
+
     only_reads: ClassVar[bool] = False
     """True for a shadow, which only reads the controller."""
 
@@ -315,6 +327,21 @@ class DriverBase(ABC):
         self.adjustable: frozenset[str] = frozenset()
         self.prove: Callable[[], None] = _prove_nothing
         self._last_written: dict[str, Value] = {}
+        self.held_z = HeldZSettings() if self.holds_z() else None
+        """The settings of a held z; None where z can't be held."""
+
+    @classmethod
+    def holds_z(cls) -> bool:
+        """Return whether z can be held: the driver overrides `move_z`."""
+        return not cls.only_reads and cls.move_z is not DriverBase.move_z
+
+    def move_z(self, z_m: float) -> None:
+        """Set z in m, as `x-tip-z` is read: positive away from the sample. Called while the feedback is off alone.
+
+        Override where the controller has a documented function for it, and give the table a row `x-tip-z`, which is
+        read-only and measured. A reading may differ from the setting by its `resolution`.
+        """
+        raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, self.cant_hold_z)
 
     def patience_s(self, of_s: float) -> float:
         """Return the longest wait, in experiment seconds, for a step that takes the controller at most `of_s`.
@@ -337,7 +364,10 @@ class DriverBase(ABC):
             ConfigError: a row has an impossible value.
         """
         where = "the experiment file"
-        table = ParameterTable.from_toml(cls.parameters_file).extended(changed, where=where, translated=cls.translated)
+        table = ParameterTable.from_toml(cls.parameters_file)
+        if cls.holds_z():
+            table = table.extended(_HELD_Z_ROWS, where="afspm")
+        table = table.extended(changed, where=where, translated=cls.translated)
         errors = ErrorCollector()
         for name in [name for name in changed if name not in cls.translated]:
             try:
@@ -583,10 +613,14 @@ class DriverBase(ABC):
         Override only where neither the table nor `groups` can describe the controller's form.
         """
         found: dict[str, Value] = {}
-        for group in self.groups:
+        for group in self._all_groups:
             if not set(group.names).isdisjoint(wanted):
                 found |= group.read()
         return found | self.read_rows([name for name in wanted if name not in found])
+
+    @property
+    def _all_groups(self) -> Sequence[SettingsGroup]:
+        return self.groups if self.held_z is None else (*self.groups, self.held_z)
 
     def read_rows(self, wanted: Sequence[str]) -> dict[str, Value]:
         """Read parameters that need only the table."""
@@ -595,7 +629,7 @@ class DriverBase(ABC):
     def write(self, values: Mapping[str, Value]) -> None:
         """Set parameters by generic names, in SI: each group together and in order, then the rest."""
         left = dict(values)
-        for group in self.groups:
+        for group in self._all_groups:
             asked = {name: left.pop(name) for name in group.names if name in left}
             if asked:
                 group.write(asked)

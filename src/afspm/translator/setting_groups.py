@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Final
 
 from afspm.basics.errors import InvalidValue, Refused
@@ -106,6 +106,35 @@ class KeptSettings(SettingsGroup):
 
     def write(self, values: Mapping[str, Value]) -> None:
         self._kept.update(values)
+
+
+class HeldZSettings(KeptSettings):
+    """The settings of a held z, which no controller has: the translator keeps and applies them (`held_z`).
+
+    Attributes:
+        moves: called with a new offset in m, before it is kept.
+        is_held: returns whether z is held.
+    """
+
+    def __init__(self) -> None:
+        super().__init__({**dict.fromkeys(names.OF_HELD_Z, 0.0), names.HELD_Z_SPEED: 100e-12})
+        self._kept = dict(self._at_first)
+        self.names = (*self.names, names.Z_IS_HELD)
+        self.moves: Callable[[float], None] = lambda offset_m: None
+        self.is_held: Callable[[], bool] = lambda: False
+
+    def read(self) -> dict[str, Value]:
+        return {**self._kept, names.Z_IS_HELD: self.is_held()}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        offset_m = values.get(names.HELD_Z_OFFSET)
+        if offset_m is not None:
+            self.moves(float(offset_m))
+        self.keep(values)
+
+    def keep(self, values: Mapping[str, Value]) -> None:
+        """Keep values without moving the tip."""
+        super().write(values)
 
 
 def check_speed(wanted_m_s: float, made_m_s: float) -> None:

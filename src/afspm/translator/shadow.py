@@ -20,7 +20,7 @@ from afspm.model import ControlResponse
 from afspm.translator.driver_base import DriverBase
 from afspm.translator.parameters import Value
 
-_REMOVED = ("set", "write", "write_rows", "command", "pulse_bias")
+_REMOVED = ("set", "write", "write_rows", "command", "pulse_bias", "move_z")
 
 
 class ShadowDriver(DriverBase):

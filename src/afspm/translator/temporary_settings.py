@@ -11,6 +11,7 @@ from collections.abc import Mapping
 
 from afspm.model import ScopeState, ScopeStatus
 from afspm.translator.driver_base import LOST, DriverBase
+from afspm.translator.held_z import HeldZ
 from afspm.translator.parameters import Value
 from afspm.translator.setters import apply
 from afspm.translator.setting_groups import MOVES
@@ -25,6 +26,7 @@ class TemporarySettings:
 
     Attributes:
         treatment: the end of a pulse or crash, for which the microscope counts as busy, too.
+        held: a z held without feedback, whose way back outlives a kill as well.
     """
 
     def __init__(self, driver: DriverBase, state: TranslatorState, log: logging.Logger) -> None:
@@ -33,6 +35,7 @@ class TemporarySettings:
         self._kept = state.kept
         self._log = log
         self.treatment = TreatmentEnd(driver, state.kept, log)
+        self.held = HeldZ(driver, state, log)
 
     def begin(self, values: Mapping[str, Value], for_s: float) -> None:
         """Set values, and restore the former values after `for_s` experiment seconds.
@@ -58,35 +61,42 @@ class TemporarySettings:
 
     @property
     def until_s(self) -> float | None:
-        """Experiment time at which the former values are restored, or the end of a treatment is looked for.
-
-        None without either.
+        """Experiment time of the next step: former values are restored, the end of a treatment is looked for, or a held
+        z is moved; None if none is due.
         """
         found = self._kept.get(_KEY)
-        return self.treatment.next_s if found is None else float(found["until_s"])
+        if found is not None:
+            return float(found["until_s"])
+        return min((one for one in (self.treatment.next_s, self.held.next_s) if one is not None), default=None)
 
     @property
     def status(self) -> ScopeStatus | None:
-        """The state of the microscope during a temporary change or a treatment; None without either."""
+        """The state of the microscope during a temporary change, a treatment or a move of a held z; otherwise None."""
         found = self._kept.get(_KEY)
-        return self.treatment.status() if found is None else ScopeStatus(state_for(found["former"]))
+        if found is not None:
+            return ScopeStatus(state_for(found["former"]))
+        return self.treatment.status() or self.held.status()
 
     def end_if_due(self) -> None:
-        """Restore the former values once they are due.
+        """Restore the former values once they are due, and watch a held z.
 
         Raises:
             an error in `LOST`.
         """
+        self.held.step()
         found = self._kept.get(_KEY)
         if found is not None and self._driver.clock.now_s() >= float(found["until_s"]):
             self.end()
 
     def end(self) -> None:
-        """Restore the former values, if any; values that the controller refuses are logged and given up.
+        """Restore the former values, if any, and begin the way back of a held z.
+
+        Values that the controller refuses are logged and given up.
 
         Raises:
             an error in `LOST`.
         """
+        self.held.end("the controller was lost, or the translator has ended in it")
         found = self._kept.get(_KEY)
         if found is None:
             return

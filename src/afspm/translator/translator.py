@@ -115,6 +115,9 @@ class Translator:
             reply=self.reply,
         )
         act, observe = self.requests.act, observer.observe
+        held = temporary.held
+        held.act, held.is_set = act, observer.is_set
+        held.switched_on = partial(observer.panel.feedback.is_set, on=True)
         self._safe_exit = SafeExit(
             connection, state, temporary, clock, log, retracts=run.retracts, act=act, observe=observe
         )

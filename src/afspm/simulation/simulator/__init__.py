@@ -23,7 +23,7 @@ from afspm.simulation.faults import INSTRUMENT_FAULTS, Fault, Faults
 from afspm.simulation.feedback import FeedbackSettings
 from afspm.simulation.instrument import SimulatedInstrument
 from afspm.simulation.settings import build
-from afspm.simulation.simulator.controller import PanelEvent, SimulatedController
+from afspm.simulation.simulator.controller import MEASURED, PanelEvent, SimulatedController
 from afspm.simulation.spectra import KINDS
 from afspm.simulation.truth import Truth
 from afspm.simulation.world import read_settings
@@ -221,6 +221,8 @@ class Simulator(Driver):
             self.channels = self.channels_of({**self._world_settings, "channels": channels})
             if not fault_action:
                 self.table = self.table.without(_FAULT_PARAMETERS)
+            if loop is not None and not loop.senses_shift:
+                self.table = self.table.without([names.FREQUENCY_SHIFT])
             if loop is not None:  # an invalid feedback leaves the unit of the setpoint unknown
                 self._check_values(loop, initial or {}, errors)
         errors.raise_all()
@@ -346,12 +348,17 @@ class Simulator(Driver):
 
             return f"simulated microscope of afspm {version('afspm')}"
         controller = self._reached(refuses=False)
+        if vendor in MEASURED:
+            return self.table[vendor].to_vendor(controller.measured(vendor, self.clock.now_s()))
         if vendor not in self.memory["values"]:
             raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, f"the simulated controller has no {vendor!r}")
         if vendor == FEEDBACK_ON:
             return controller.instrument.feedback_reads(self.clock.now_s())
         value: Value = self.memory["values"][vendor]
         return value
+
+    def move_z(self, z_m: float) -> None:
+        self._reached(refuses=True).move_z(z_m, self.clock.now_s())
 
     def set(self, values: Mapping[str, Value]) -> None:
         """Set values; frame and probe move at the move speed."""

@@ -36,6 +36,9 @@ ADJUSTED: Final = (names.ZCTRL_SETPOINT, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN, n
 
 _OF_KIND: Final = (*names.SPEC_Z_ENDS, names.SPEC_POINTS, names.SPEC_POINT_TIME)
 """Settings that each kind of curve has for itself."""
+_SIGNALS: Final = {names.CURRENT: "Current", names.FREQUENCY_SHIFT: "Frequency Shift"}
+MEASURED: Final = (names.TIP_Z, *_SIGNALS)
+"""Parameters that are measured at each reading."""
 _STATES: Final = {
     "": ScopeState.FREE,
     "scan": ScopeState.SCANNING,
@@ -188,8 +191,12 @@ class SimulatedController:
         rate_m_s = (float(after[names.DRIFT_RATE_X]), float(after[names.DRIFT_RATE_Y]))
         if rate_m_s != (float(before[names.DRIFT_RATE_X]), float(before[names.DRIFT_RATE_Y])):
             self.instrument.follow(rate_m_s, now_s)
-        if any(before.get(name) != after.get(name) for name in ADJUSTED):  # a table of parameters may lack some
+        is_on_again = after.get(FEEDBACK_ON) is True and before.get(FEEDBACK_ON) is False
+        is_adjusted = any(before.get(name) != after.get(name) for name in ADJUSTED)  # a table may lack some
+        if is_adjusted:
             self.instrument.adjust(now_s)
+        if is_adjusted or is_on_again:
+            self.instrument.press(now_s)
         way_m = _distance(before, after, names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y)
         if way_m > 0.0 or _distance(before, after, names.PROBE_POS_X, names.PROBE_POS_Y) > 0.0:
             self.stop(now_s)  # a change allowed at this moment ends the measurement
@@ -198,6 +205,24 @@ class SimulatedController:
                 frame_m = self.instrument.setup.region.center_m if way_m > 0.0 else None
                 self.instrument.move_probe(place_m, now_s, way_m=way_m, frame_m=frame_m)
         self._keep()
+
+    def move_z(self, z_m: float, now_s: float) -> None:
+        """Set z, as long as the feedback is off.
+
+        Raises:
+            Refused: the feedback is on.
+        """
+        if self.instrument.setup.feedback.on is not False:
+            raise Refused(ControlResponse.ACTION_ERROR, "the z feedback is on")
+        with _refusing():
+            self.instrument.hold(z_m, now_s)
+        self._keep()
+
+    def measured(self, name: str, now_s: float) -> float:
+        """Return z, the current or the frequency shift as measured now."""
+        if name == names.TIP_Z:
+            return self.instrument.z_m(now_s)
+        return self.instrument.signals(now_s)[_SIGNALS[name]]
 
     def _curves_at_first(self, kind: str) -> dict[str, Value]:
         found = _first_settings(kind, self.instrument.world.settings)
