@@ -14,6 +14,7 @@ from afspm.translator.driver_base import LOST
 from afspm.translator.state import TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
 
+_STEP_S = 0.02  # real time between steps of the way back of a held z
 _LOOK_S = 0.1  # real time between looks whether the tip moves
 _TIP_S = 8.0
 """Real time for attempts to retract the tip when the run is stopped: the controller may be lost just then, or refuse. A
@@ -73,8 +74,11 @@ class SafeExit:
         self._connection.guarded(self._stop_measuring)
         if self._connection.stands:
             self._connection.guarded(self._temporary.end)
-        # the feedback is not switched on instead: where the tip would land by then is not known (decision 0007)
         until_s = self._clock.monotonic_s() + _TIP_S
+        # the height of a held z is known, and so is where the tip lands
+        while self._connection.stands and self._temporary.held.is_ending and self._clock.monotonic_s() < until_s:
+            wait(_STEP_S)
+        # the feedback is not switched on instead: where the tip would land by then is not known (decision 0007)
         has_asked = False
         while has_asked or self.is_owed():
             is_off = has_asked or self._state.feedback.is_off

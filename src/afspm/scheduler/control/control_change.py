@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from afspm.basics.frozen import replace
-from afspm.model import ControlMode, ControlResponse, Problem, ResponseDetail
+from afspm.model import ControlMode, ControlResponse, Problem, ResponseDetail, names
 from afspm.model.idempotency_cache import RequestStatus
 from afspm.model.microscope_status import feedback_of
 from afspm.model.sessions import token_of
@@ -118,6 +118,8 @@ def _carry_out(draft: StateDraft, change: _Change) -> None:
     draft.lease = draft.lease.held_by(after.holder, draft.now_ns)
     if draft.panel.why and after.mode is not ControlMode.MANUAL:  # a person has let the run continue
         draft.panel = replace(draft.panel, why="")
+        if draft.microscope.risk.holds_z:  # its holder has lost control, and another component may get it
+            draft.watchdog = draft.watchdog.stopping(names.RELEASE_Z)
     if after.holder is not None and after.holder != before.holder and rules.is_agent(after.holder):
         draft.lease = draft.lease.asked(AGENT_LEASE_S, draft.now_s)  # also for a client that requests no lease
     _log_change(draft, change, _alert_watchdog(draft, change))

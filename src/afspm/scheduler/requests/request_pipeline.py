@@ -442,7 +442,7 @@ def _knows_no_danger(draft: StateDraft, job: ForwardedRequest) -> bool:
     if job.client != draft.control.holder or not draft.microscope.endangered_by_feedback or reads(job.request):
         return False
     retracts = job.request.kind == _ACTION and job.request.subject == draft.watchdog.settings.retract
-    feedback = feedback_of(job.request)
+    feedback = feedback_of(job.request) if job.request.kind != _ACTION else None
     is_aware = retracts or (feedback is not None and feedback.on is not None)
     return not is_aware and control_change.is_other_life(draft, draft.peers.sessions.token(job.client))
 
@@ -681,6 +681,9 @@ def _settle_late(draft: StateDraft, job: ForwardedRequest, response: Response) -
 
 
 def _track_feedback(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
+    is_over = response.code == ControlResponse.ACTION_ERROR  # the translator has gone the way back by itself
+    if is_over and job.request.kind == _ACTION and job.request.subject == names.RELEASE_Z:
+        draft.microscope = draft.microscope.holding_z(names.RELEASE_Z)
     feedback = feedback_of(job.request)
     if feedback is None or feedback.on is not False or response.ok:
         return
@@ -703,7 +706,7 @@ def _apply_success(draft: StateDraft, job: ForwardedRequest, response: Response)
         response = replace(response, payload=draft.env.codec.encode(mapped))
     if request.kind == _ACTION:
         _action_started(draft, job, is_certain=True)
-    elif (feedback := feedback_of(request)) is not None:
+    if (feedback := feedback_of(request)) is not None:
         draft.microscope = draft.microscope.with_feedback(feedback)
         if feedback.on is not None and job.client and job.client == draft.control.holder:
             # from now on the restarted holder answers for the feedback itself

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from afspm.model import ControlRequest, ControlResponse, Request, Response
+from afspm.model import ControlRequest, ControlResponse, Request, Response, names
 from afspm.scheduler.requests.forwarder import ForwardedRequest, ForwardOutcome
 from afspm.scheduler.safety.watchdog import SafetyResult, TipDuty
 from afspm.scheduler.state import StateDraft
@@ -60,6 +60,9 @@ def settle(draft: StateDraft, job: ForwardedRequest, end: ForwardOutcome, respon
     draft.watchdog, result = draft.watchdog.answered(response.code, draft.microscope, now_s)
     if is_retract and result is SafetyResult.DONE:
         draft.microscope = draft.microscope.with_tip(away=True)
+    # refused: it is over already, or has failed; the translator has withdrawn the tip then
+    if subject == names.RELEASE_Z and result is not SafetyResult.AGAIN:
+        draft.microscope = draft.microscope.holding_z(subject)
     if draft.panel.why:  # a person acted at the microscope meanwhile
         leave_to_person(draft)
     send(draft)

@@ -2,6 +2,8 @@
 
 It stops the running scan or spectrum after the causes in `stop_when`. It retracts a tip that the holder left in a
 dangerous state, unless the holder gave control back or a person took over: no other component knows of the danger.
+A z that the holder held without feedback is released first, after any cause: the translator knows the way back, and
+once the feedback is on again, nothing is retracted.
 """
 
 from __future__ import annotations
@@ -143,6 +145,7 @@ class Watchdog:
         due_s: the real time at which `look_again` is due.
         retries: the number of failed retracts in a row; each doubles the wait.
         in_haste: whether the experiment ends, so that all waits are short.
+        returning: whether the way back of a held z has begun: a retract waits for its end.
     """
 
     settings: WatchdogSettings = field(default_factory=WatchdogSettings)
@@ -157,6 +160,7 @@ class Watchdog:
     due_s: float | None = None
     retries: int = 0
     in_haste: bool = False
+    returning: bool = False
 
     def restored(self, tip: RetractState) -> Watchdog:
         """Restore the duty from before a restart: an unanswered retract is owed again."""
@@ -234,7 +238,9 @@ class Watchdog:
         if microscope.state not in STOPS:
             dog = replace(dog, told_to_stop=False, unstoppable=False)
         # the measurement ended before a stop could be sent
-        return dog._with_stops(()) if microscope.state is ScopeState.FREE and self.sent is None else dog
+        if microscope.state is not ScopeState.FREE or self.sent is not None:
+            return dog
+        return dog._with_stops(tuple(one for one in dog.tip.stops if one == names.RELEASE_Z))
 
     def started(self, action: str, states_seen: int, microscope: MicroscopeStatus) -> Watchdog:
         """Register an action that succeeded, or may have; `states_seen` states were known when it was sent.
@@ -273,8 +279,10 @@ class Watchdog:
             dog = dog.seen_to()
         if dog.can_retract and (had_died or not knows) and microscope.danger is not None:
             dog = dog._endangered(microscope)
+        if microscope.risk.holds_z or in_flight == names.HOLD_Z:
+            dog = dog.stopping(names.RELEASE_Z)
         stop = dog.to_stop(in_flight, microscope)
-        is_to_stop = cause in dog.settings.stop_when or dog.owes_retract
+        is_to_stop = cause in dog.settings.stop_when or dog.owes_retract or names.RELEASE_Z in dog.tip.stops
         return dog.stopping(stop) if is_to_stop and stop is not None else dog
 
     def to_stop(self, in_flight: str | None, microscope: MicroscopeStatus) -> str | None:
@@ -295,9 +303,11 @@ class Watchdog:
         return replace(dog.seen_to()._with_stops(()), starting=None)
 
     def newly_wanted(self, before: Watchdog) -> list[str]:
-        """Return the actions wanted now and not before."""
+        """Return the actions wanted now and not before, as far as it is certain that they will be sent."""
         known = () if before.put_off else before.wanted
-        return [] if self.put_off else [action for action in self.wanted if action not in known]
+        # once z is released, nothing is retracted unless that fails
+        wanted = self.tip.stops if names.RELEASE_Z in self.tip.stops else self.wanted
+        return [] if self.put_off else [action for action in wanted if action not in known]
 
     def _endangered(self, microscope: MicroscopeStatus) -> Watchdog:
         if self.settings.retract is None:
@@ -321,8 +331,8 @@ class Watchdog:
     def next_action(self, microscope: MicroscopeStatus) -> tuple[Watchdog, str | None]:
         """Return the action to send now, which counts as sent; None: no action."""
         dog = self
-        if dog.tip.for_feedback and microscope.risk.feedback_on is True:
-            dog = dog.seen_to()
+        if microscope.risk.feedback_on is True:
+            dog = replace(dog.seen_to() if dog.tip.for_feedback else dog, returning=False)
         if dog.sent is not None or dog.put_off or dog.refused_at == microscope.states_seen:
             return dog, None
         runs = STOPS.get(microscope.state)
@@ -336,7 +346,8 @@ class Watchdog:
 
     def _waits_for_stop(self, microscope: MicroscopeStatus) -> bool:
         # a retract is sent only once the scan has stopped
-        return not self.tip.stops and microscope.state in STOPS and not self.unstoppable
+        is_running = microscope.state in STOPS or self.returning
+        return not self.tip.stops and is_running and not self.unstoppable
 
     def answered(self, code: int, microscope: MicroscopeStatus, now_s: float) -> tuple[Watchdog, SafetyResult]:
         """Process the translator's answer to the sent action; `code` is NO_RESPONSE if there was no answer."""
@@ -346,7 +357,8 @@ class Watchdog:
             if is_retract:
                 return dog._after(TipEvent.RETRACTED), SafetyResult.DONE
             due_s = now_s + dog._wait_s if dog.owes_retract else None
-            return replace(dog._without_stop(action), due_s=due_s), SafetyResult.DONE
+            returning = action == names.RELEASE_Z
+            return replace(dog._without_stop(action), due_s=due_s, returning=returning), SafetyResult.DONE
         if code == ControlResponse.NOT_FREE:
             dog = replace(dog, refused_at=microscope.states_seen, due_s=now_s + dog._wait_s)
             return dog._after(TipEvent.NOT_YET), SafetyResult.AGAIN
@@ -389,14 +401,15 @@ class Watchdog:
         if dog.put_off:
             return replace(dog, refused_at=-1)._after(TipEvent.SEEN_TO if is_seen_to else TipEvent.DUE), None
         if not dog.wanted or dog.sent is not None:
-            return dog, None
+            return replace(dog, returning=False), None
         if dog.tip.stops:
             action = dog.tip.stops[0]
             dog = replace(dog._without_stop(action), unstoppable=True, refused_at=-1)
             return dog, f"the microscope is never free to {action}"
         is_refused = dog.refused_at == microscope.states_seen
         if not is_refused and dog._waits_for_stop(microscope):
-            return replace(dog, unstoppable=True), "the microscope does not stop, although a stop was sent"
+            what = "is not back from a held z" if dog.returning else "does not stop, although a stop was sent"
+            return replace(dog, unstoppable=True, returning=False), f"the microscope {what}"
         why = "the microscope is never free for that" if is_refused else "its translator is not there"
         warning = None if dog.retries else f"the tip was left in danger and can't be retracted: {why}"
         return dog._retract_later(now_s), warning
