@@ -414,6 +414,8 @@ class LimitChecker:
                 self._check_use(use, name, limit, "parameter")
             if limit is not None and value is not None:
                 self._check_value(name, value, limit, use.now_ns)
+            if name == names.HELD_Z_OFFSET and value is not None and value < 0.0:
+                _check_towards(value, limit)
             if name in _OF_CURVES and value is not None:
                 for one in self._limits_on(name):
                     self._check_of_curve(name, value, one)
@@ -572,6 +574,16 @@ class LimitChecker:
         if self.state.position.probe_m is None:
             raise _param_error("the microscope has not reported its probe position, so a part of it can't be checked")
         self._check_point(moved(self.state.position.probe_m, change))
+
+
+def _check_towards(value: float, limit: Limit | None) -> None:
+    # without a feedback nothing else keeps the tip from the sample
+    if limit is None or limit.low is None:
+        offset = quantity(value, (limit and limit.unit) or "m")
+        raise _param_error(
+            f"{names.HELD_Z_OFFSET} = {offset} is towards the sample, which no limit bounds: write "
+            f"[limits.{names.HELD_Z_OFFSET}] min = … into the experiment file"
+        )
 
 
 def _unseen(kind: str, end: str, limit: Limit) -> str:

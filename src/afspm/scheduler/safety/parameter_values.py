@@ -9,7 +9,7 @@ from typing import NamedTuple
 from afspm.basics.errors import AfspmError
 from afspm.basics.units import convert
 from afspm.model import Feedback, Parameter, PositionChange, ProbePosition, ScanParameters, names
-from afspm.model.parameter_names import BASE_PARAMETERS, OF_CURVES
+from afspm.model.parameter_names import BASE_PARAMETERS, OF_CURVES, OF_HELD_Z
 from afspm.model.positions import scan_values
 from afspm.scheduler.safety.limits import Limit
 
@@ -85,7 +85,7 @@ def _number(parameter: Parameter, text: str, limit: Limit | None) -> float | Non
             return None
         raise ParameterValueError(f"{name} = {text!r} is not a number") from None
     _finite(name, value)
-    si = BASE_PARAMETERS.get(name) or OF_CURVES.get(name)
+    si = BASE_PARAMETERS.get(name) or OF_CURVES.get(name) or OF_HELD_Z.get(name)
     unit = limit.unit if limit is not None and limit.unit is not None else si
     # without a unit an angle is in degrees on the wire, everything else in SI
     given = parameter.unit or ("deg" if unit == "rad" else unit)
