@@ -12,7 +12,7 @@ from typing import TypedDict, Unpack, get_args
 
 from afspm import wire
 from afspm.basics import RequestError
-from afspm.basics.errors import ExperimentEnded, InvalidValue, Refused
+from afspm.basics.errors import ControlLost, ExperimentEnded, InvalidValue, Refused
 from afspm.basics.plain_data import Plain
 from afspm.basics.units import si_or_text
 from afspm.client.command_retry import CommandRetry, refused
@@ -21,6 +21,7 @@ from afspm.client.events import Events, PublishedEvent
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.experiment_view import ExperimentView, checked_call
 from afspm.client.former_values import FormerValues, Steps
+from afspm.client.held_height import HeldHeight
 from afspm.client.instrument_targets import InstrumentTargets
 from afspm.client.keyed_results import KeyedResults, check_key
 from afspm.client.measurement import MeasurementRunner
@@ -382,6 +383,62 @@ class Scope(ExperimentView):
                     publish(result.conditions, None)
                     publish(result.spectrum, f"Spec1d_{result.spectrum.kind}")
             return result.spectrum
+
+    @checked_call
+    @contextmanager
+    def hold_z(
+        self,
+        offset: float | str,
+        *,
+        bias: float | str | None = None,
+        speed: float | str = "100 pm/s",
+        abort_current: float | str | None = None,
+        abort_frequency_shift: float | str | None = None,
+        timeout_s: float | None = None,
+    ) -> Iterator[HeldHeight]:
+        """Hold the tip in the block at an offset from the height of its setpoint, without feedback.
+
+            with scope.hold_z(offset="-100 pm", bias="1 mV", abort_current="2 nA") as held:
+                current_a = held.read("x-current")
+                scans = scope.scan(region)
+
+        The feedback is switched off and read as off, then the bias is set, then z is moved. The block may take scans
+        and spectra, read values, and move on by `held.move`. At its end, also by an error, the translator sets back z,
+        then bias, setpoint and gains, and switches the feedback on. It does so by itself if the component ends or loses
+        control, which raises ControlLost at the next call, and if a bound is reached, which raises Refused. Where the
+        way back fails, the feedback stays off, and the tip is withdrawn.
+
+        Args:
+            offset: height in m or as text, negative towards the sample, which a limit on `x-held-z-offset` must allow.
+            bias: bias while z is held; None: unchanged.
+            speed: speed of z.
+            abort_current, abort_frequency_shift: absolute values beyond which z is held no more, compared at each poll
+                of the controller; None: no bound.
+
+        Raises:
+            Refused: the microscope can't hold z, a limit refuses, or z was held no more before the end of the block.
+        """
+        bounds = {names.HELD_Z_ABORT_CURRENT: abort_current, names.HELD_Z_ABORT_SHIFT: abort_frequency_shift}
+        # 0 removes a bound of an earlier block; a microscope without such a value has none
+        settings = [(names.HELD_Z_SPEED, speed), *((name, 0.0 if one is None else one) for name, one in bounds.items())]
+        parameters = tuple(to_parameter(name, value, None) for name, value in settings)
+        until_s = self._link.until(timeout_s)
+        held = HeldHeight(parameters, until_s, link=self._link, control=self._control, commands=self._commands)
+        with self._control.hold(until_s=until_s, unbroken=True, keeps=True):
+            with self._call():
+                held.prepare(offset)
+            try:
+                with self._call():
+                    held.begin(offset, bias)
+                yield held
+            except (ExperimentEnded, StopRequested, ControlLost):
+                raise  # the scheduler has the way back begun
+            except BaseException:  # also Ctrl-C, and what the block of the user raises
+                with suppress(RequestError):  # the first error says more
+                    held.release()
+                raise
+            with self._call():
+                held.release()
 
     def _each_in_a_call(self, points: Iterator[SweepPoint]) -> Iterator[SweepPoint]:
         while True:
