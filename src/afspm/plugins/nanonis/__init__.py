@@ -490,6 +490,9 @@ class Nanonis(Driver):
         on = 1
         self._ask("ZCtrl.OnOffSet", on)
 
+    def move_z(self, z_m: float) -> None:
+        self._ask("ZCtrl.ZPosSet", z_m)
+
     def command(self, text: str) -> None:
         """Call a function with its arguments, e.g. "AutoApproach.OnOffSet 1"."""
         call = FunctionCall.of(text)

@@ -15,7 +15,7 @@ QUESTIONS: Final = frozenset({
     *("Scan.StatusGet", "Scan.WaitEndOfScan", "Scan.FrameGet", "Scan.BufferGet", "Scan.SpeedGet", "Scan.PropsGet"),
     *("Scan.FrameDataGrab", "FolMe.XYPosGet", "FolMe.SpeedGet"),
     *("ZCtrl.OnOffGet", "ZCtrl.SetpntGet", "ZCtrl.GainGet", "ZCtrl.StatusGet", "ZCtrl.LimitsGet", "ZCtrl.ZPosGet"),
-    *("ZCtrl.CtrlListGet", "Current.GainsGet", "Piezo.TiltGet", "Piezo.DriftCompGet"),
+    *("ZCtrl.CtrlListGet", "Current.Get", "Current.GainsGet", "Piezo.TiltGet", "Piezo.DriftCompGet"),
     *("Piezo.RangeGet", "Piezo.CalibrGet", "Piezo.XYZLimitsGet"),
     *("BiasSpectr.StatusGet", "ZSpectr.StatusGet", "AutoApproach.OnOffGet"),
 })  # fmt: skip
