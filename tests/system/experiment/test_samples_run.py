@@ -42,6 +42,7 @@ QUICKER: dict[str, tuple[str, int, int]] = {
     "feedback_gains": ('[series]\nduration = "90 min"\npixels = [32, 32]\n', 4, 0),
     "best_points": ("[best_points]\nrounds = 1\nbest = 2\npixels = 32\n[random_points]\npoints = 5\n", 3, 0),
     "time_lapse": ("[series]\nscans = 3\npixels = [64, 64]\n", 4, 0),  # one of them by the Rescanner
+    "constant_height": ('[stack]\npixels = 16\nheights = ["0 pm", "-100 pm"]\n', 3, 0),
     "particle_survey": ("[survey]\ncount = 2\n", 4, 4),  # one of them by the Rescanner
     "paper_form": ('scan_pixels = [16, 16]\n[series]\nduration = "10 min"\n', 1, 0),
 }
