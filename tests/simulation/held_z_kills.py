@@ -54,7 +54,7 @@ class Controller(Simulator):
         self.calls, self.kill_at, self.refuses = 0, -1, ""
 
     @property
-    def memory(self) -> dict[str, Any]:  # type: ignore[override]
+    def memory(self) -> dict[str, Any]:
         return self._own
 
     @memory.setter
@@ -165,7 +165,7 @@ class HeldZNight:
         self.port = _Port(self._clock)
         self._memory = memory = Memory(self._folder / "translator.json", synced=False)
         run, log = TranslatorRun(self._folder), logging.getLogger("held-z")
-        self.translator = Translator(self.controller, self.port, memory, run, log)  # type: ignore[arg-type]
+        self.translator = Translator(self.controller, self.port, memory, run, log)
 
     def close(self) -> None:
         """End the threads that write files."""

@@ -364,12 +364,12 @@ class DriverBase(ABC):
             ConfigError: a row has an impossible value.
         """
         where = "the experiment file"
-        table = ParameterTable.from_toml(cls.parameters_file)
+        table, translated = ParameterTable.from_toml(cls.parameters_file), {*cls.translated, *_HELD_Z_ROWS}
         if cls.holds_z():
             table = table.extended(_HELD_Z_ROWS, where="afspm")
-        table = table.extended(changed, where=where, translated=cls.translated)
+        table = table.extended(changed, where=where, translated=translated)
         errors = ErrorCollector()
-        for name in [name for name in changed if name not in cls.translated]:
+        for name in [name for name in changed if name not in translated]:
             try:
                 cls.check_row(table[name])
             except InvalidValue as error:
