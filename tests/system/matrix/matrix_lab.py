@@ -61,6 +61,9 @@ def _happens(job: str, instrument: str) -> str:
         return 'drift = ["0.1 nm/s", "-0.06 nm/s"]' if job == "drift" else ""
     if job == "drift":
         return "drift = { velocity_m_per_s = [0.1e-9, -0.06e-9, 0.0] }"
+    if job == "potential" and instrument in ("simulator", "gxsm", "nanonis"):  # the others have no tunnelling sensor
+        spots = 'property_map = { kind = "smooth", quantity = "contact_potential" }'
+        return f'feedback = {{ mode = "current", setpoint = 50e-12, qplus = true }}\n{spots}'
     if job == "feedback" and instrument == "gxsm":
         return 'feedback = { mode = "current" }'  # its mixer's setpoint is a current
     of_tip = {

@@ -39,6 +39,7 @@ PICTURE = 0.3  # of the relief: the feedback misses 0.1 at the usual gain, and a
 FOLLOWS = 0.2  # of the relief, by which the analysis calls a feedback good
 NION_NOISE = 0.3  # that Nion adds to each pixel, in flakes
 QUANTITY = 0.05
+POTENTIAL_V = 0.005
 PLACE_PX = 1.5  # a busy computer begins a scan later than its place was predicted for; without correction 6
 MIDDLE_S = 5.0
 LATE_S = 15.0  # of experiment time, a quarter of a second in real time
@@ -471,9 +472,13 @@ def mapped_by(function: Callable[[afspm.Spectrum], float]) -> Proof:
 
 
 def mapped(
-    quantity: str, true_value: Callable[[Evidence, tuple[float, float], float], float], at_least: int = 6
+    quantity: str,
+    true_value: Callable[[Evidence, tuple[float, float], float], float],
+    within: float,
+    at_least: int = 6,
+    unit: str = "",
 ) -> Proof:
-    """Return a proof: the map of a shipped quantity has the true values."""
+    """Return a proof: the map of a shipped quantity has the true values, within a share of them or within a unit."""
 
     def proof(found: Evidence) -> str:
         rows = _map(found)
@@ -481,9 +486,10 @@ def mapped(
             if len(found.truth.curves) < at_least:
                 raise NotFinished(f"{len(found.truth.curves)} of {at_least} curves were taken")
             return NOTHING
-        ratios = [value / true_value(found, (x_m, y_m), time_s) for x_m, y_m, value, time_s, *_ in rows]
-        middle = statistics.median(ratios)
-        return "" if abs(middle - 1.0) <= QUANTITY else f"{middle:.1g} times the true {quantity}"
+        pairs = [(value, true_value(found, (x_m, y_m), time_s)) for x_m, y_m, value, time_s, *_ in rows]
+        off = statistics.median(value - true if unit else value / true - 1.0 for value, true in pairs)
+        beside = f"{off:+.2g} {unit}" if unit else f"{off:+.1%}"
+        return "" if abs(off) <= within else f"{beside} beside the true {quantity}"
 
     return proof
 
@@ -494,6 +500,19 @@ def true_adhesion_n(found: Evidence, position_m: tuple[float, float], time_s: fl
     soft, hard = world.settings.force.adhesion_j_per_m2
     material = found.simulated.material(position_m, time_s)
     return 2.0 * math.pi * world.tip.imaging_radius_m * (soft * (1.0 - material) + hard * material)
+
+
+def sampled_adhesion_n(found: Evidence, position_m: tuple[float, float], time_s: float) -> float:
+    """Return the lowest force of the noiseless curve: its pull-off is between two of its points."""
+    curve = min(found.truth.curves, key=lambda one: math.dist(one.position_m, position_m))
+    names, _, values = found.simulated.world(**_QUIET_CURVES).spectrum(curve.kind, curve.position_m, curve.time_s)
+    return -float(values[:, names.index("Force Retrace")].min())
+
+
+def true_potential_v(found: Evidence, position_m: tuple[float, float], time_s: float) -> float:
+    true = found.simulated.world().property_truth(position_m, time_s)["property"]
+    assert isinstance(true, dict)
+    return float(true["value"])
 
 
 def true_gap_ev(found: Evidence, position_m: tuple[float, float], time_s: float) -> float:
@@ -581,8 +600,13 @@ PROOFS: Mapping[str, Mapping[str, Proof]] = {
     "adaptive": {
         "Adaptive": all_of(curves(6), mapped_by(lambda curve: float(curve.values[len(curve.values) // 2, -1])))
     },
-    "adhesion": {"Adaptive (adhesion)": mapped("adhesion", true_adhesion_n)},
-    "gap": {"Adaptive (gap)": mapped("gap", true_gap_ev)},
+    "adhesion": {
+        "Adaptive (adhesion)": all_of(
+            mapped("adhesion", sampled_adhesion_n, 0.01), mapped("adhesion", true_adhesion_n, QUANTITY)
+        )
+    },
+    "gap": {"Adaptive (gap)": mapped("gap", true_gap_ev, 0.01)},
+    "potential": {"Adaptive (contact potential)": mapped("contact potential", true_potential_v, POTENTIAL_V, unit="V")},
     "survey": {"Survey": all_of(taken(2), surveyed)},
     "lines": {"LineWatch": watched},
     "hours": {"QuietHours": all_of(taken(4), paused)},

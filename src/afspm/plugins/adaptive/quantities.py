@@ -5,29 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Final
 
 import numpy as np
-from scipy.optimize import curve_fit
 
 from afspm.basics import ConfigError, InvalidValue, NoSuchItem
 from afspm.components import Array
 from afspm.model import Spectrum
+from afspm.model.variables import BIAS, FREQUENCY_SHIFT, RETRACE
+from afspm.plugins.adaptive.band_gap import band_gap
+from afspm.plugins.adaptive.pull_off import pull_off
 from afspm.transport import find_object
 
-_EDGE: Final = (0.2, 0.65)
-"""Shares of the largest conductance on the side of a band edge. Up to the second the conductance rises as the square
-root of the energy beyond the edge; between both, broadening hardly matters."""
 _LEAST_POINTS: Final = 4
-_CLIPPED: Final = 0.99
-"""Share of the largest current above which the preamplifier may be saturated."""
-_FAR: Final = 30.0
-"""In widths of the broadening: where a broadened square root is a square root."""
 _MOST_ERROR: Final = 0.25
 """Largest standard error of the vertex of a parabola, as a share of the range of the bias."""
 _MOST_SKEW: Final = 0.2
 """Largest cubic coefficient of a parabola, relative to its quadratic one, over the range of the bias."""
+_MOST_ALIKE: Final = 0.98
 _LEAST_CURVED: Final = 5.0
 """Least curvature of a parabola, in its standard errors."""
 
@@ -66,36 +61,11 @@ class Evaluation:
 
 
 def gap_ev(spectrum: Spectrum) -> float:
-    """Return the band gap in eV: the distance of the band edges in dI/dV.
+    """Return the gap in eV: the distance of the edges of the density of states; of a superconductor 2 Delta.
 
-    At an edge the conductance rises as the square root of the energy. Temperature, modulation and steps of the bias
-    round it by a width that is fitted with the edge: a line through the squares alone would lie outside the edges by
-    some ten meV at room temperature.
-
-    Raises:
-        NoSuchItem: the spectrum has no bias, or neither conductance nor current. InvalidValue: it shows no band edges.
+    Raises: as `band_gap`.
     """
-    bias = _bias(spectrum)
-    order = np.argsort(bias)
-    bias = bias[order]
-    current = spectrum.of("current")[order] if spectrum.has("current") else None
-    if spectrum.has("conductance"):
-        conductance = spectrum.of("conductance")[order]
-    else:
-        conductance = np.gradient(spectrum.of("current")[order], bias)
-    if current is not None:  # a saturated preamplifier passes no modulation
-        passed = np.abs(current) < _CLIPPED * np.abs(current).max(initial=0.0)
-        bias, conductance = bias[passed], conductance[passed]
-    width = 2 * (len(bias) // 100) + 1
-    if len(bias) <= 2 * width:
-        raise InvalidValue("the curve has no band edge", hint="sweep the bias farther, with more points")
-    smoothed = np.convolve(conductance, np.full(width, 1.0 / width), mode="same")
-    lowest = width + int(np.argmin(smoothed[width : len(bias) - width]))
-    right = _edge(bias[lowest:-width], conductance[lowest:-width], smoothed[lowest:-width])
-    left = _edge(
-        -bias[lowest : width - 1 : -1], conductance[lowest : width - 1 : -1], smoothed[lowest : width - 1 : -1]
-    )
-    return right + left
+    return band_gap(spectrum).value_ev
 
 
 @dataclass(frozen=True)
@@ -112,13 +82,23 @@ class KelvinParabola:
 
 
 def kelvin_parabola(spectrum: Spectrum) -> KelvinParabola:
-    """Fit a parabola to the frequency shift over the bias.
+    """Fit a parabola to the frequency shift over the bias, of each way.
+
+    A drift of the frequency shift moves the vertex by its rate over the bias, divided by twice the curvature: one way
+    alone does not show that. Of both ways it moves the vertices apart, as hysteresis does, and their mean stays.
 
     Raises:
         NoSuchItem: the spectrum has no bias or no frequency shift. InvalidValue: there is no parabola: too few points,
             no maximum, a skew course, or a vertex outside the sweep.
     """
-    bias, shift = _bias(spectrum), spectrum.of("frequency shift")
+    there = _parabola(_bias(spectrum), spectrum.of(FREQUENCY_SHIFT))
+    if not (spectrum.has(FREQUENCY_SHIFT + RETRACE) and spectrum.has(BIAS + RETRACE)):
+        return there
+    back = _parabola(spectrum.of(BIAS + RETRACE), spectrum.of(FREQUENCY_SHIFT + RETRACE))
+    return KelvinParabola((there.vertex_v + back.vertex_v) / 2.0, math.hypot(there.error_v, back.error_v) / 2.0)
+
+
+def _parabola(bias: Array, shift: Array) -> KelvinParabola:
     good = np.isfinite(bias) & np.isfinite(shift)
     bias, shift = bias[good], shift[good]
     extent = float(np.ptp(bias)) if len(bias) else 0.0
@@ -135,7 +115,8 @@ def kelvin_parabola(spectrum: Spectrum) -> KelvinParabola:
         raise InvalidValue("the frequency shift is no parabola: it has no maximum", hint="sweep the bias farther")
     vertex = -linear / (2.0 * square)
     slopes = np.array([0.0, -1.0 / (2.0 * square), linear / (2.0 * square**2)])
-    error = math.sqrt(slopes @ covariance @ slopes)
+    inflation = _inflation(shift - design @ with_cubic)
+    error = math.sqrt(inflation * slopes @ covariance @ slopes)
     if not (abs(vertex) <= 0.5 and error < _MOST_ERROR):
         raise InvalidValue("the vertex of the parabola is outside the sweep", hint="move the range of the bias")
     odd = abs(float(with_cubic[3]))
@@ -153,15 +134,11 @@ def contact_potential_v(spectrum: Spectrum) -> float:
 
 
 def adhesion_n(spectrum: Spectrum) -> float:
-    """Return the pull-off force in N: the negative of the lowest force while the tip withdraws.
+    """Return the pull-off force in N: how far the lowest force of the way back is below the free cantilever.
 
-    Raises:
-        NoSuchItem: the spectrum has no force, or no way back: the approach has its lowest force at the snap-in.
+    Raises: as `pull_off`.
     """
-    force = spectrum.of("force, retrace")
-    if (unit := spectrum.si_unit_of("force, retrace")) != "N":
-        raise InvalidValue(f"the force is in {unit or 'no unit'}", hint="calibrate the cantilever at the controller")
-    return -float(force.min())
+    return pull_off(spectrum).force_n
 
 
 QUANTITIES: Final = {
@@ -169,7 +146,7 @@ QUANTITIES: Final = {
     "contact_potential": Evaluation(
         "contact_potential", "V", "IV", contact_potential_v, (("bias",), ("frequency shift",))
     ),
-    "adhesion": Evaluation("adhesion", "N", "force", adhesion_n, (("force, retrace",),)),
+    "adhesion": Evaluation("adhesion", "N", "force", adhesion_n, (("height",), ("force, retrace",))),
 }
 
 
@@ -198,9 +175,9 @@ def evaluation(quantity: str, unit: str = "", kind: str | None = None) -> Evalua
 
 
 def _bias(spectrum: Spectrum) -> Array:
-    if (unit := spectrum.si_unit_of("bias")) not in ("V", ""):
+    if (unit := spectrum.si_unit_of(BIAS)) not in ("V", ""):
         raise InvalidValue(f"the bias is in {unit}")
-    return spectrum.of("bias")
+    return spectrum.of(BIAS)
 
 
 def _least_squares(design: Array, values: Array) -> tuple[Array, Array]:
@@ -211,43 +188,7 @@ def _least_squares(design: Array, values: Array) -> tuple[Array, Array]:
     return fit, inverse * variance
 
 
-@cache
-def _rounded() -> tuple[Array, Array]:
-    # the square root of x, rounded by the derivative of a Fermi function with a width of 1
-    step = 0.02
-    x = np.arange(-_FAR, _FAR, step)
-    wide = np.arange(-2.0 * _FAR, 2.0 * _FAR, step)
-    kernel = 0.25 / np.cosh(x / 2.0) ** 2 * step
-    return x, np.interp(x, wide, np.convolve(np.sqrt(np.maximum(wide, 0.0)), kernel, mode="same"))
-
-
-def _rounded_root(x: Array) -> Array:
-    # beyond the table, the series of Sommerfeld
-    far = np.maximum(x, 1.0)
-    return np.where(x < 0.8 * _FAR, np.interp(x, *_rounded()), np.sqrt(far) * (1.0 - math.pi**2 / 24.0 / far**2))
-
-
-def _edge(outwards: Array, conductance: Array, smoothed: Array) -> float:
-    # `outwards` rises from the middle of the gap; the result is the bias of the edge
-    highest = float(smoothed.max(initial=0.0))
-    above = np.flatnonzero(smoothed > _EDGE[0] * highest)
-    beyond = np.flatnonzero(smoothed > _EDGE[1] * highest)
-    if highest <= 0.0 or not len(above) or not len(beyond) or beyond[0] - above[0] < _LEAST_POINTS:
-        raise InvalidValue("the curve has no band edge", hint="sweep the bias farther, with more points")
-    part = slice(int(above[0]), int(beyond[0]))
-    slope, offset = np.polyfit(outwards[part], smoothed[part] ** 2, 1)
-    if slope <= 0.0:
-        raise InvalidValue("the curve has no band edge", hint="average more sweeps")
-    x, y = outwards[: beyond[0]], conductance[: beyond[0]] / highest
-    step, extent = float(np.diff(x).mean()), float(np.ptp(outwards))
-
-    def model(x: Array, edge: float, width: float, root: float, floor: float) -> Array:
-        return floor + root * math.sqrt(width) * _rounded_root((x - edge) / width)
-
-    start = (-offset / slope, 0.02 * extent, math.sqrt(slope) / highest, 0.0)
-    bounds = ((x[0], 0.1 * step, 0.0, -0.2), (x[-1], extent / 20.0, np.inf, 0.2))
-    try:
-        found, _ = curve_fit(model, x, y, np.clip(start, *bounds), bounds=bounds)
-    except (RuntimeError, ValueError) as error:
-        raise InvalidValue("the curve has no band edge", hint="average more sweeps") from error
-    return float(found[0])
+def _inflation(left: Array) -> float:
+    # noise of low frequency is alike in neighbouring points, and averages out the less
+    alike = float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-300)
+    return (1.0 + min(max(alike, 0.0), _MOST_ALIKE)) / (1.0 - min(max(alike, 0.0), _MOST_ALIKE))

@@ -100,6 +100,7 @@ _VARIABLES: Final = VariableRoles.declared(
         "deflection": ["Deflection"],
         "deflection, retrace": ["Deflection Retrace"],
         "frequency shift": ["dFreq"],
+        "frequency shift, retrace": ["dFreq Retrace"],
         "amplitude": ["Ampl", "McBSP Ampl"],
         "excitation": ["Exec", "McBSP Exec"],
     }

@@ -50,7 +50,13 @@ _MIXERS: Final = {
     "frequency-shift": ("dsp-fbs-mx1-freq-set", "Hz", 1.0),
 }
 """Entry of the setpoint, unit, and SI value of this unit, by the mode of the feedback."""
-_COLUMNS: Final = {"Bias": "Bias-mon", "Z": "Z-mon", "Current": "CurrentSim1"}
+_COLUMNS: Final = {
+    "Bias": "Bias-mon",
+    "Z": "Z-mon",
+    "Current": "CurrentSim1",
+    "Frequency Shift": "dFreq",
+    "Frequency Shift Retrace": "dFreq Retrace",
+}
 
 
 @dataclass(frozen=True)
