@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from afspm.basics import InvalidValue
-from afspm.model import Spectrum
-from afspm.model.arrays import Array
-from afspm.model.caption import SettingInForce
-from afspm.model.parameter_names import LOCK_IN_AMPLITUDE
+from afspm.components import Array
+from afspm.driver import SettingInForce
+from afspm.model import Spectrum, names
 from afspm.plugins.adaptive.band_gap import band_gap
 from afspm.plugins.adaptive.pull_off import pull_off
 from afspm.plugins.adaptive.quantities import kelvin_parabola
@@ -25,10 +24,10 @@ def force_curve(adhesion_n: float, *, noise_n: float = 2e-11, ripple_n: float = 
     free = 3e-7 + 4e-3 * (z - z[-1]) + ripple_n * np.sin(2.0 * np.pi * z / 335e-9 + 1.0)
     ways = [np.where(z < least_n / K_N_PER_M, -K_N_PER_M * z, 0.0) for least_n in (1e-9, adhesion_n)]
     there, back = (free + way + noise_n * random.standard_normal(len(z)) for way in ways)
-    columns, names = (
+    columns, labels = (
         ([z, there, back], ("Z", "Force", "Force Retrace")) if both else ([z, back], ("Z", "Force Retrace"))
     )
-    return Spectrum((0.0, 0.0), "force", names, ("m", "N", "N")[: len(names)], np.stack(columns, 1))
+    return Spectrum((0.0, 0.0), "force", labels, ("m", "N", "N")[: len(labels)], np.stack(columns, 1))
 
 
 # before, the pull-off force was the lowest recorded force, with the offset of the deflection in it
@@ -74,7 +73,7 @@ def tunnelling(
     """Return dI/dV on the inner half of the energies, with noise."""
     bias = np.linspace(energy[0] / 2.0, energy[-1] / 2.0, 256)
     values = np.interp(bias, energy, conductance) + noise * np.random.default_rng(2).standard_normal(256)
-    stated = () if modulation_v is None else (SettingInForce(LOCK_IN_AMPLITUDE, "V", modulation_v, modulation_v),)
+    stated = () if modulation_v is None else (SettingInForce(names.LOCK_IN_AMPLITUDE, "V", modulation_v, modulation_v),)
     return Spectrum((0.0, 0.0), "IV", ("Bias", "dI/dV"), ("V", "S"), np.stack([bias, values], 1), in_force=stated)
 
 
@@ -117,8 +116,8 @@ def test_drift_of_the_frequency_shift_goes_out_of_both_ways() -> None:
     both = np.concatenate([bias, bias[::-1]])
     shift = -8.0 * (both - 0.2) ** 2 + np.linspace(0.0, 2.0, 202)  # Hz; 2 Hz of it are drift
     noise = 1e-3 * np.random.default_rng(1).standard_normal(202)
-    names, units = ("Bias", "Frequency Shift"), ("V", "Hz")
-    curve = Spectrum((0.0, 0.0), "IV", names, units, np.stack([both, shift + noise], 1))
-    one_way = Spectrum((0.0, 0.0), "IV", names, units, curve.values[:101])
+    labels, units = ("Bias", "Frequency Shift"), ("V", "Hz")
+    curve = Spectrum((0.0, 0.0), "IV", labels, units, np.stack([both, shift + noise], 1))
+    one_way = Spectrum((0.0, 0.0), "IV", labels, units, curve.values[:101])
     assert kelvin_parabola(one_way).vertex_v == pytest.approx(0.2 + 1.0 / 2.0 / 16.0, abs=0.003)
     assert kelvin_parabola(curve).vertex_v == pytest.approx(0.2, abs=0.001)

@@ -29,10 +29,12 @@ from scipy.special import j1
 
 from afspm.basics import InvalidValue
 from afspm.components import Array
-from afspm.model import Spectrum
-from afspm.model.parameter_names import LOCK_IN_AMPLITUDE
-from afspm.model.variables import BIAS, CONDUCTANCE, CURRENT, RETRACE
+from afspm.model import Spectrum, names
 
+_BIAS: Final = "bias"
+_CONDUCTANCE: Final = "conductance"
+_CURRENT: Final = "current"
+_BACK: Final = ", retrace"
 _LEAST_POINTS: Final = 24
 _CLIPPED: Final = 0.99
 """Share of the largest current above which the preamplifier may be saturated."""
@@ -145,15 +147,15 @@ class _Curve:
 
     @classmethod
     def of(cls, spectrum: Spectrum) -> _Curve:
-        if (unit := spectrum.si_unit_of(BIAS)) not in ("V", ""):
+        if (unit := spectrum.si_unit_of(_BIAS)) not in ("V", ""):
             raise InvalidValue(f"the bias is in {unit}")
-        is_current = not spectrum.has(CONDUCTANCE)
-        bias, values = _both_ways(spectrum, CURRENT if is_current else CONDUCTANCE)
-        stated = [one.constant for one in spectrum.in_force if one.name == LOCK_IN_AMPLITUDE and one.unit == "V"]
+        is_current = not spectrum.has(_CONDUCTANCE)
+        bias, values = _both_ways(spectrum, _CURRENT if is_current else _CONDUCTANCE)
+        stated = [one.constant for one in spectrum.in_force if one.name == names.LOCK_IN_AMPLITUDE and one.unit == "V"]
         modulation_v = 0.0 if is_current else next(iter(stated), None)
         good = np.isfinite(bias) & np.isfinite(values)
-        if spectrum.has(CURRENT):
-            current = np.abs(_both_ways(spectrum, CURRENT)[1])
+        if spectrum.has(_CURRENT):
+            current = np.abs(_both_ways(spectrum, _CURRENT)[1])
             good &= ~_saturated(bias, current, modulation_v or 0.0)
         bias, values = bias[good], values[good]
         order = np.argsort(bias)
@@ -271,10 +273,10 @@ def _superconductor(curve: _Curve) -> _Density:
 
 def _both_ways(spectrum: Spectrum, role: str) -> tuple[Array, Array]:
     # the mean of both ways, if they are at the same biases: what the time of a sweep adds goes out with its direction
-    bias, values = spectrum.of(BIAS), spectrum.of(role)
-    if not spectrum.has(role + RETRACE):
+    bias, values = spectrum.of(_BIAS), spectrum.of(role)
+    if not spectrum.has(role + _BACK):
         return bias, values
-    bias_back, back = spectrum.of(BIAS + RETRACE), spectrum.of(role + RETRACE)
+    bias_back, back = spectrum.of(_BIAS + _BACK), spectrum.of(role + _BACK)
     for step in (1, -1):
         if len(back) == len(values) and np.allclose(bias, bias_back[::step], rtol=0.0, atol=1e-3 * float(np.ptp(bias))):
             return bias, (values + back[::step]) / 2.0

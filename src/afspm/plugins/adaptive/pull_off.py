@@ -18,8 +18,8 @@ import numpy as np
 from afspm.basics import InvalidValue
 from afspm.components import Array
 from afspm.model import Spectrum
-from afspm.model.variables import FORCE, HEIGHT, RETRACE
 
+_BACK: Final = ", retrace"
 _LEAST_POINTS: Final = 32
 _FREE: Final = 0.25
 """Share of each way, at its far end, where the cantilever has to be free."""
@@ -65,10 +65,10 @@ def pull_off(spectrum: Spectrum) -> PullOff:
             snap-in. InvalidValue: the force is not in N, no attraction is above the noise, or it is known to less than
             a tenth.
     """
-    if spectrum.has(FORCE + RETRACE) and (unit := spectrum.si_unit_of(FORCE + RETRACE)) != "N":
+    if spectrum.has("force" + _BACK) and (unit := spectrum.si_unit_of("force" + _BACK)) != "N":
         raise InvalidValue(f"the force is in {unit or 'no unit'}", hint="calibrate the cantilever at the controller")
-    back = _Way.of(spectrum, RETRACE)
-    has_approach = spectrum.has(FORCE) and spectrum.has(HEIGHT)
+    back = _Way.of(spectrum, _BACK)
+    has_approach = spectrum.has("force") and spectrum.has("height")
     baseline = _Baseline.of([back, _Way.of(spectrum, "")] if has_approach else [back])
     force = back.force_n - baseline.at(back.height_m)
     lowest = int(np.argmin(force))
@@ -91,7 +91,7 @@ class _Way:
 
     @classmethod
     def of(cls, spectrum: Spectrum, way: str) -> _Way:
-        force, height = spectrum.of(FORCE + way), spectrum.of(HEIGHT + way)
+        force, height = spectrum.of("force" + way), spectrum.of("height" + way)
         good = np.isfinite(height) & np.isfinite(force)
         height, force = height[good], force[good]
         if len(height) < _LEAST_POINTS or not np.ptp(height):

@@ -12,7 +12,6 @@ import numpy as np
 from afspm.basics import ConfigError, InvalidValue, NoSuchItem
 from afspm.components import Array
 from afspm.model import Spectrum
-from afspm.model.variables import BIAS, FREQUENCY_SHIFT, RETRACE
 from afspm.plugins.adaptive.band_gap import band_gap
 from afspm.plugins.adaptive.pull_off import pull_off
 from afspm.transport import find_object
@@ -91,10 +90,10 @@ def kelvin_parabola(spectrum: Spectrum) -> KelvinParabola:
         NoSuchItem: the spectrum has no bias or no frequency shift. InvalidValue: there is no parabola: too few points,
             no maximum, a skew course, or a vertex outside the sweep.
     """
-    there = _parabola(_bias(spectrum), spectrum.of(FREQUENCY_SHIFT))
-    if not (spectrum.has(FREQUENCY_SHIFT + RETRACE) and spectrum.has(BIAS + RETRACE)):
+    there = _parabola(_bias(spectrum), spectrum.of("frequency shift"))
+    if not (spectrum.has("frequency shift, retrace") and spectrum.has("bias, retrace")):
         return there
-    back = _parabola(spectrum.of(BIAS + RETRACE), spectrum.of(FREQUENCY_SHIFT + RETRACE))
+    back = _parabola(spectrum.of("bias, retrace"), spectrum.of("frequency shift, retrace"))
     return KelvinParabola((there.vertex_v + back.vertex_v) / 2.0, math.hypot(there.error_v, back.error_v) / 2.0)
 
 
@@ -175,9 +174,9 @@ def evaluation(quantity: str, unit: str = "", kind: str | None = None) -> Evalua
 
 
 def _bias(spectrum: Spectrum) -> Array:
-    if (unit := spectrum.si_unit_of(BIAS)) not in ("V", ""):
+    if (unit := spectrum.si_unit_of("bias")) not in ("V", ""):
         raise InvalidValue(f"the bias is in {unit}")
-    return spectrum.of(BIAS)
+    return spectrum.of("bias")
 
 
 def _least_squares(design: Array, values: Array) -> tuple[Array, Array]:
