@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from afspm.basics.errors import ControlLost
 from afspm.client.command_retry import CommandRetry
 from afspm.client.experiment_link import PublishedState
 from afspm.client.instrument_targets import InstrumentTargets
@@ -45,10 +46,16 @@ class MeasurementSetup:
         Raises as `InstrumentTargets.reach` and `Withdrawal.bring_back`; returns early if control is lost.
         """
         others = [one for one in target.settings if is_of_instrument(one.name)]
-        if target.withdraws and not all(self._targets.is_reached(one, until_s) for one in others):
-            self._withdrawal.withdraw(until_s)
-        reached = tuple(self._targets.reach(one, until_s) for one in others)
-        self._withdrawal.bring_back(until_s)
+        if not target.withdraws:
+            return tuple(self._targets.reach(one, until_s) for one in others)
+        try:
+            with self._withdrawal.unbroken(until_s):
+                if not all(self._targets.is_reached(one, until_s) for one in others):
+                    self._withdrawal.withdraw(until_s)
+                reached = tuple(self._targets.reach(one, until_s) for one in others)
+                self._withdrawal.bring_back(until_s)
+        except ControlLost:
+            return ()  # the measurement begins again, with its targets
         return reached
 
     def prepare(self, target: Target, key: str, until_s: float | None, reached: tuple[Parameter, ...] = ()) -> None:
@@ -69,10 +76,14 @@ class MeasurementSetup:
             in_force = tuple(self._commands.set_parameter(one, until_s) for one in of_microscope)
             self._commands.publish_settings((*reached, *in_force), key, target.point)
 
-    def move_probe(self, xy_m: XY, until_s: float | None) -> None:
-        """Move the probe to (x, y) in m, unless it is there already."""
+    def move_probe(self, xy_m: XY, until_s: float | None, *, drifts: bool = False) -> None:
+        """Move the probe to (x, y) in m, unless it is there already.
+
+        Args:
+            drifts: whether the place is one of the sample, which is elsewhere for the tip a while later.
+        """
         now = self._view.probe_position
-        if now is None or now.xy_m != xy_m:
+        if drifts or now is None or now.xy_m != xy_m:
             self._commands.set(ControlRequest.SET_PROBE_POS, ProbePosition(xy_m), "ProbePosition", until_s)
 
     def set_scan(self, wanted: ScanParameters, until_s: float | None) -> None:

@@ -466,14 +466,24 @@ class Scope(ExperimentView):
             with self._call():
                 until_s = self._link.until(timeout_s)
                 if withdraw and former.left_behind:
-                    self._withdrawal.withdraw(until_s)
-                former.set_back(until_s)
-                if withdraw:
-                    self._withdrawal.leave_withdrawn()
-                    self._link.log.info("the tip stays withdrawn, while the instruments go back")
+                    self._set_back_withdrawn(former, until_s)
+                else:
+                    former.set_back(until_s)
         except (RequestError, ExperimentEnded, StopRequested):
             self._log_left_behind(former)
             raise
+
+    def _set_back_withdrawn(self, former: FormerValues, until_s: float | None) -> None:
+        while True:
+            try:
+                with self._withdrawal.unbroken(until_s):
+                    self._withdrawal.withdraw(until_s)
+                    former.set_back(until_s)
+                    break
+            except ControlLost:
+                self._control.regain(until_s)  # others may have brought the tip to the sample: from the beginning
+        self._withdrawal.leave_withdrawn()
+        self._link.log.info("the tip stays withdrawn, while the instruments go back")
 
     def _log_left_behind(self, former: FormerValues) -> None:
         if former.left_behind:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from afspm import wire
-from afspm.basics.errors import ControlLost, InvalidValue, Refused
+from afspm.basics.errors import ControlLost, InvalidValue, NoResponse, Refused
 from afspm.basics.plain_data import Plain
-from afspm.client.command_retry import CommandRetry, refused
+from afspm.client.command_retry import PATIENCE_S, RETRY_S, CommandRetry, refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.former_values import FormerValues
@@ -21,6 +21,7 @@ from afspm.client.targets import SpectrumTarget
 from afspm.model import (
     ControlRequest,
     ControlResponse,
+    Frame,
     MeasurementConditions,
     Parameter,
     Spectrum,
@@ -112,14 +113,14 @@ class PlacedSweeper:
     def _measure(self, sweep: PlacedSweep, until_s: float | None) -> tuple[Spectrum, MeasurementConditions]:
         link, target = self._link, sweep.target
         if target.at_m is not None:
-            self._setup.move_probe(target.at_m, until_s)
+            self._setup.move_probe(target.at_m, until_s, drifts=target.frame is Frame.SAMPLE)
         began_ns, rows = link.clock.now_ns(), []
         for place in range(len(sweep.axis.values)):
             in_force = self._set(sweep.axis.parameter(place), until_s)
             self._settle(sweep.settle_s)
-            if not self._control.held:
-                raise ControlLost(f"control was lost: {self._control.why_lost}", where=link.name)
             readings = [self._read(name, until_s) for name in sweep.read]
+            if not self._control.held:  # others may have changed the setting while it was read
+                raise ControlLost(f"control was lost: {self._control.why_lost}", where=link.name)
             rows.append([_number(in_force, link.name), *readings])
         names = (sweep.axis.name, *sweep.read)
         columns = [_column(name, [row[number] for row in rows]) for number, name in enumerate(names)]
@@ -143,10 +144,18 @@ class PlacedSweeper:
                 self._link.wait(lambda: not self._control.held, self._link.until(clock.real_s(left_s)))
 
     def _read(self, name: str, until_s: float | None) -> Reading:
-        response = self._commands.read(ControlRequest.PARAM, Parameter(newest_of(name)), until_s)
-        if not response.ok:
-            raise refused(ControlRequest.PARAM, response, name)
-        return _number(wire.decode_parameter(response.payload), name)
+        # an instrument that has no value for a moment, by an overload or a restart, is read again
+        give_up_s = self._link.earlier(PATIENCE_S, until_s)
+        while True:
+            response = self._commands.read(ControlRequest.PARAM, Parameter(newest_of(name)), until_s)
+            if response.ok:
+                return _number(wire.decode_parameter(response.payload), name)
+            if response.code != ControlResponse.PARAM_ERROR or not is_of_instrument(name):
+                raise refused(ControlRequest.PARAM, response, name)
+            if self._link.clock.monotonic_s() >= give_up_s:
+                what = f"{name} has had no value for {PATIENCE_S:g} s"
+                raise NoResponse(what, where=self._link.name, hint=response.reason)
+            self._link.wait(lambda: False, self._link.earlier(RETRY_S, give_up_s))
 
 
 def _number(parameter: Parameter, where: str) -> Reading:

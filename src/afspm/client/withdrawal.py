@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from afspm import wire
 from afspm.basics.errors import NoResponse, Refused
 from afspm.client.command_retry import SETTLED_WITHIN_S, CommandRetry
 from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.keyed_results import KeyedResults
-from afspm.model import ControlRequest, ControlResponse, ScopeState, names
+from afspm.model import ControlRequest, ControlResponse, Parameter, ScopeState, names
 
 SHOWN_WITHIN_S = 20.0  # real time: the tip is published some readings after the state
 
@@ -20,37 +24,68 @@ class Withdrawal:
     ) -> None:
         self._link, self._control, self._commands, self._results = link, control, commands, results
 
+    @contextmanager
+    def unbroken(self, until_s: float | None) -> Iterator[None]:
+        """Hold control in the block; after a loss of control nothing in it goes on, since others may move the tip."""
+        with self._control.hold(until_s=until_s, unbroken=True):
+            yield
+
     def withdraw(self, until_s: float | None) -> None:
-        """Withdraw the tip. Control must be held. Raises as `bring_back`."""
+        """Withdraw the tip. Control must be held.
+
+        Raises:
+            Refused: another has withdrawn the tip; or as `bring_back`.
+            NoResponse: as `bring_back`.
+        """
+        if self._is_engaged(until_s) is False:
+            if not self._results.is_withdrawn:
+                what = "the tip is withdrawn already, and not by this sweep, which would bring it to the sample"
+                hint = f"bring it to the sample first ({names.ENGAGE})"
+                raise Refused(ControlResponse.ACTION_ERROR, f"{what}: {hint}")
+            return
         self._results.is_withdrawn = True  # before, since after a kill it may be so
         self._move(names.RETRACT, until_s, engages=False)
 
     def bring_back(self, until_s: float | None) -> None:
-        """Bring the tip to the sample, if `withdraw` was called last; nothing is done without control.
+        """Bring the tip to the sample, if `withdraw` has withdrawn it. Control must be held.
 
         Raises:
             Refused: the microscope refuses, or reports that the tip is not where it should be.
             NoResponse: the microscope is not free again by `until_s`.
         """
-        if self._results.is_withdrawn and self._control.held:
-            self._move(names.ENGAGE, until_s, engages=True)
+        if self._results.is_withdrawn:
+            if self._is_engaged(until_s) is not True:
+                self._move(names.ENGAGE, until_s, engages=True)
             self.leave_withdrawn()
 
     def leave_withdrawn(self) -> None:
         """Forget that the tip was withdrawn: nothing brings it back."""
         self._results.is_withdrawn = False
 
+    def _is_engaged(self, until_s: float | None) -> bool | None:
+        # read now: the tip is published some readings after it moved
+        response = self._commands.read(ControlRequest.PARAM, Parameter(names.ENGAGED), until_s)
+        if not response.ok or not response.payload:
+            return None
+        value = (wire.decode_parameter(response.payload).value or "").lower()
+        return True if value in names.ON_WORDS else False if value in names.OFF_WORDS else None
+
     def _move(self, action: str, until_s: float | None, *, engages: bool) -> None:
         link, view = self._link, self._link.view
-        if view.tip is not None and view.tip.engaged is engages:
-            return
         count = view.count("ScopeStateMsg")
         self._commands.ask(ControlRequest.ACTION, action, until_s=until_s)
         link.wait(lambda: view.count("ScopeStateMsg") != count, link.earlier(SETTLED_WITHIN_S, until_s))
-        if not link.wait(lambda: view.state is ScopeState.FREE, until_s):
+        if not self._wait(lambda: view.state is ScopeState.FREE, until_s):
             raise NoResponse(f"{action} has not ended in time", where=link.name)
-        if not link.wait(
+        is_shown = self._wait(
             lambda: view.tip is None or view.tip.engaged in (None, engages), link.earlier(SHOWN_WITHIN_S, until_s)
-        ):
+        )
+        if not is_shown:
             place = "withdrawn" if engages else "at the sample"
             raise Refused(ControlResponse.ACTION_ERROR, f"the microscope reports the tip as {place} after {action}")
+
+    def _wait(self, done: Callable[[], bool], until_s: float | None) -> bool:
+        # in an unbroken block a loss of control is an error: others may have moved the tip
+        is_done = self._link.wait(lambda: done() or not self._control.held, until_s)
+        self._control.regain(until_s)
+        return is_done

@@ -198,9 +198,10 @@ class Sweep(Component):
         sweep = to_plain(self.sweep) | {"measure": self.measure}
         if self.sweep.repeat == 1:
             del sweep["repeat"]  # not in what runs of earlier versions have saved
-        if self.memory.setdefault("sweep", sweep) != sweep:
+        places = to_plain({"regions": self.regions, "positions": self.positions})
+        if self.memory.setdefault("sweep", sweep) != sweep or self.memory.setdefault("places", places) != places:
             raise ConfigError(
-                "the sweep was begun with other values, which are in the record of this run",
+                "the sweep was begun with other values or places, which are in the record of this run",
                 where="parameters",
                 hint="undo the change, or begin a new run",
             )

@@ -11,6 +11,7 @@ from typing import Any
 
 from afspm import wire
 from afspm.basics.clock import iso_utc
+from afspm.basics.errors import InvalidValue
 from afspm.model import TOPOGRAPHY, Packet, ProblemNames, Scan
 from afspm.record import nexus_writer, provenance
 from afspm.record.journal import SCHEDULER
@@ -184,11 +185,15 @@ class MeasuredFiles:
         packet, spectrum = taken.packet, taken.spectrum
         published_ns = packet.time_ns or 0
         time_ns = published_ns if spectrum.time_ns is None else spectrum.time_ns
-        # a restarted translator publishes a spectrum again: it is recorded once
+        # a restarted translator or component publishes a spectrum again: it is recorded once
         known = self._journal.execute(
-            "SELECT number FROM spectra WHERE time_ns = ? AND filename = ? AND kind = ?",
+            "SELECT number, x, y, points FROM spectra WHERE time_ns = ? AND filename = ? AND kind = ?",
             (time_ns, spectrum.filename, spectrum.kind),
         ).fetchone()
+        place = (None, None) if spectrum.position_m is None else spectrum.position_m
+        if known is not None and known[1:] != (*place, spectrum.values.shape[0]):
+            what = f"another spectrum {spectrum.kind!r} has the same time: number {known[0]}"
+            raise InvalidValue(what, hint="give each spectrum the time of its own measurement")
         if known is None:
             stood = provenance.control_at_start(self._journal, published_ns, spectrum)
             number, name = self._next(SPECTRA, time_ns)
@@ -196,7 +201,6 @@ class MeasuredFiles:
             facts |= self._surroundings(published_ns, stood, {spectrum.filename}, time_ns)
             at = FileProvenance(time_ns, stood.began_ns, facts, header_of(spectrum.filename, self._folder))
             self._batch.write(self._folder / name, nexus_writer.encode_spectrum(spectrum, at))
-            place = (None, None) if spectrum.position_m is None else spectrum.position_m
             names, units = (json.dumps(texts, ensure_ascii=False) for texts in (spectrum.names, spectrum.units))
             self._journal.execute(
                 f"INSERT INTO spectra VALUES ({', '.join('?' * 15)})",

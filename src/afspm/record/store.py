@@ -143,10 +143,6 @@ class RecordStore:
         waits = ((one.time_ns, one.envelope) == (packet.time_ns, packet.envelope) for one in self._gathering.waiting())
         return row.fetchone() is not None or any(waits)
 
-    def _has_spectrum(self, spectrum: Spectrum) -> bool:
-        sql = "SELECT 1 FROM spectra WHERE time_ns = ? AND kind = ?"
-        return self._journal.execute(sql, (spectrum.time_ns, spectrum.kind)).fetchone() is not None
-
     def note(self, name: str, value: object) -> None:
         """Record a fact about the whole run, in JSON's types."""
         text = json.dumps(value, ensure_ascii=False)
@@ -202,8 +198,6 @@ class RecordStore:
                 self._write(self._gathering.scan(packet, self._placed(thing)))
             case ScanLines() if self._about.measured:
                 self._write(self._gathering.lines(packet, self._placed(thing)))
-            case Spectrum() if source != SCHEDULER and self._has_spectrum(thing):
-                return  # a component that was killed just after publishing its own spectrum publishes it again
             case Spectrum() if self._about.measured:
                 self._write(self._gathering.spectrum(packet, replace(self._roles.shown(thing), frame=self._frame)))
             case _:

@@ -306,6 +306,7 @@ class TipLab(SourceLab):
 
     def execute(self, request: Request) -> Response:
         subject = request.subject
+        self.values[names.ENGAGED] = "true" if self.is_engaged else "false"
         if isinstance(subject, Parameter) and subject.name == "source.bias" and subject.value is not None:
             self.noted.append(f"{subject.value} {'engaged' if self.is_engaged else 'withdrawn'}")
         if subject == names.START_SCAN and not self.is_engaged:
@@ -355,6 +356,51 @@ def test_killed_at_any_step_the_tip_is_withdrawn_at_each_target_and_back_for_eac
             lab.noted.pop()
         assert lab.noted == WITHDRAWN_EACH_TIME, f"killed at call {deadly_call}"
     assert deadly_call > 40
+
+
+def test_tip_that_another_had_withdrawn_is_not_brought_to_the_sample() -> None:
+    lab = TipLab()
+    lab.is_engaged = False
+    with (
+        pytest.raises(Refused, match="withdrawn already, and not by this sweep"),
+        scope_of(lab).sweep({"source.bias": ["10 V"]}, shape=(8, 8), withdraw=True) as points,
+    ):
+        list(points)
+    assert not lab.is_engaged
+    assert lab.noted == []
+
+
+@pytest.mark.parametrize("at_s", [0.5, 1.5, 2.5, 3.5, 4.5, 6.0])
+def test_no_instrument_moves_with_the_tip_at_the_sample_though_a_repair_brings_it_there(at_s: float) -> None:
+    lab = TipLab()
+
+    def taken_over() -> None:
+        lab.flag(Problem.TIP_SHAPE_CHANGED)
+        lab.is_engaged = True  # a repair brings the tip to the sample
+        lab.values |= {"source.bias.target": "77", "source.bias": "77", "source.bias.busy": "false"}
+
+    lab.at(2 * SCAN_S + at_s, taken_over)
+    lab.at(2 * SCAN_S + at_s + 60.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    temperatures(scope_of(lab))
+    assert not any(one.endswith("engaged") for one in lab.noted), lab.noted
+    assert lab.at_volt == ["4.2", "4.2", "10", "10"]
+    assert not lab.is_engaged
+
+
+def test_scan_outside_of_a_sweep_brings_no_tip_to_the_sample(tmp_path: Path) -> None:
+    lab = TipLab()
+    for deadly_call in range(60, 200):
+        lab = TipLab()
+        folder = tmp_path / str(deadly_call)
+        with pytest.raises(Kill9):
+            temperatures(scope_of(lab, folder, 0, LabPort(lab, deadly_call)))
+        if not lab.is_engaged:
+            break
+    assert not lab.is_engaged
+    lab.restart_component()
+    with pytest.raises(Refused, match="the tip is withdrawn"):
+        scope_of(lab, folder, 1).scan(shape=(8, 8))
+    assert not lab.is_engaged
 
 
 def test_withdrawal_without_an_instrument_is_refused() -> None:
@@ -452,6 +498,37 @@ def test_sweep_at_a_place_is_taken_again_after_control_was_lost() -> None:
     assert spectrum["lockin.x"].tolist() == [25.0, 36.0, 49.0, 36.0]
     assert lab.targets[:2] == ["5", "6"]
     assert lab.targets[-5:] == ["5", "6", "7", "6", "4.2"]
+
+
+def test_control_lost_at_the_last_reading_spoils_the_sweep() -> None:
+    lab, published = EsrLab(), list[Any]()
+    lost: list[bool] = []
+
+    def during_the_last_reading(request: Request) -> Response | str:
+        reads = isinstance(request.subject, Parameter) and request.subject.name == "lockin.x.now"
+        if reads and lab.targets == ["5", "6", "7", "6"] and not lost:
+            lost.append(True)
+            lab.flag(Problem.TIP_SHAPE_CHANGED)
+            lab.values |= {"source.bias.target": "77", "source.bias": "77"}
+            lab.at(30.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+        return "go on"
+
+    lab.intercept = during_the_last_reading
+    assert esr(scope_of(lab), published)["lockin.x"].tolist() == [25.0, 36.0, 49.0, 36.0]
+    assert lost
+
+
+def test_reading_that_is_lacking_for_a_moment_is_taken_again() -> None:
+    lab, refused = EsrLab(), list[str]()
+
+    def overload(request: Request) -> Response | str:
+        if isinstance(request.subject, Parameter) and request.subject.name == "lockin.x.now" and len(refused) < 3:
+            refused.append("overload")
+            return Response(ControlResponse.PARAM_ERROR, reason="overload")
+        return "go on"
+
+    lab.intercept = overload
+    assert esr(scope_of(lab), [])["lockin.x"].tolist() == [25.0, 36.0, 49.0, 36.0]
 
 
 def test_killed_at_any_step_a_sweep_at_a_place_has_one_result_and_is_set_back() -> None:

@@ -560,3 +560,12 @@ def test_spectrum_that_a_component_publishes_again_after_a_kill_is_recorded_once
     store.take([(once, "esr"), (again, "esr")])
     store.take([(replace(again, time_ns=(again.time_ns or 0) + 1), "esr")])
     assert len(afspm.open_run(tmp_path).spectra) == 1
+
+
+def test_other_spectrum_of_the_same_time_is_kept_and_named(
+    night: Night, store: RecordStore, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    here = Spectrum((0.0, 0.0), "rf", ("rf", "x"), ("Hz", "V"), np.zeros((3, 2)), START_NS)
+    store.take([(night.packet(here)[0], "esr"), (night.packet(replace(here, position_m=(1e-9, 0.0)))[0], "esr")])
+    assert len(afspm.open_run(tmp_path).spectra) == 1
+    assert "another spectrum 'rf' has the same time: number 1" in caplog.text

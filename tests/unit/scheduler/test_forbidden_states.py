@@ -251,3 +251,14 @@ def test_change_of_the_sample_bias_is_a_change_at_the_panel() -> None:
     rule = ForbiddenState("changes(sample-bias) and SCANNING", {}, bias_sign=-1.0)
     both = ExperimentLimits(forbid={"": rule})
     assert refusal(both, set_(BIAS, "1", "V"), present(ScopeState.SCANNING))
+
+
+def test_target_of_an_instrument_makes_it_busy() -> None:
+    rule = limits("cryo.t.busy and x-engaged")
+    why = refusal(rule, set_("cryo.t", "4.6", "K"), present(x_engaged="true", cryo__t__busy="false"))
+    assert why.startswith("cryo.t.busy = true is forbidden while x-engaged = true")
+    why = refusal(rule, action("start-scan"), present(ScopeState.FREE, x_engaged="true", cryo__t__busy="true"))
+    assert "start-scan is forbidden while" in why
+    either = limits("changes(x-engage) and cryo.t.busy")
+    why = refusal(either, action("x-engage"), present(cryo__t__busy="true"))
+    assert why.endswith("; first wait until cryo.t has arrived")

@@ -21,7 +21,7 @@ from typing import Final
 
 from afspm.basics.formatting import quantity
 from afspm.model import ControlRequest, Feedback, Parameter, Request, ScopeState, names
-from afspm.model.instruments import instrument_of
+from afspm.model.instruments import SEPARATOR, instrument_of, is_of_instrument
 from afspm.model.parameter_names import BASE_PARAMETERS
 from afspm.scheduler.safety import rule_language
 from afspm.scheduler.safety.limits import ExperimentLimits, ForbiddenState, Limit
@@ -37,6 +37,7 @@ _WORDS: Final = {
     **dict.fromkeys((*names.ON_WORDS, "1.0"), True),
     **dict.fromkeys((*names.OFF_WORDS, "0.0"), False),
 }
+_BUSY: Final = f"{SEPARATOR}busy"
 _MOST_COMBINATIONS = 4096  # of candidates; beyond, a rule counts as unknown, since the scheduler must not stand still
 
 
@@ -73,7 +74,8 @@ def changed_by(limits: ExperimentLimits, request: Request) -> dict[str, Paramete
         changed.update(values_in(subject))
     acts = [name for name in changed if name not in STATES]
     acts += [str(request.subject)] if request.kind == ControlRequest.ACTION else []
-    changed.update({switch: Parameter(switch, "true") for switch in map(rule_language.change_of, acts)})
+    switches = [*map(rule_language.change_of, acts), *(f"{name}{_BUSY}" for name in changed if is_of_instrument(name))]
+    changed.update({switch: Parameter(switch, "true") for switch in switches})
     return changed
 
 
@@ -145,7 +147,8 @@ class PlanRehearsal:
         why = refusal(self._limits, request, PresentState(self._known), certain=True)
         if not why:
             changed = changed_by(self._limits, request).items()  # a scan ends by itself
-            self._known.update({name: (value,) for name, value in changed if name not in STATES})
+            lasting = {name: (value,) for name, value in changed if name not in STATES and not name.endswith(_BUSY)}
+            self._known.update(lasting)  # an instrument arrives
         return why
 
 
@@ -282,6 +285,8 @@ def _cure(atom: RuleAtom) -> str:
     if not isinstance(atom, RuleComparison):
         if atom.name == names.ENGAGED and atom.on:
             return f"withdraw the tip ({names.RETRACT})"
+        if atom.name.endswith(_BUSY) and atom.on:
+            return f"wait until {atom.name.removesuffix(_BUSY)} has arrived"
         if atom.name in STATES:
             return f"wait until the microscope is {'not ' if atom.on else ''}{atom.name}"
         return f"set {atom.name} to {'false' if atom.on else 'true'}"
