@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from client_lab import Kill9, Lab, LabPort, context_of, run
+from client_lab import EPOCH_S, Kill9, Lab, LabPort, context_of, run
 
 from afspm.basics import ConfigError, ExitCode, InvalidValue, MeasurementFailed
 from afspm.emulation import World
@@ -118,6 +118,27 @@ def test_positions_that_are_refused_one_after_the_other_end_the_component(tmp_pa
     component = adaptive("height_of_the_right_half", center=(-2e-6, 0.0))
     with pytest.raises(MeasurementFailed, match="10 positions in a row gave no value"):
         run(component, Lab("map"), tmp_path / "state", run_dir=str(tmp_path))
+
+
+def drifting_waves(spectrum: Spectrum) -> float:
+    """Return waves that move by 10 pm/s."""
+    assert spectrum.position_m is not None
+    assert spectrum.time_ns is not None
+    x, y = spectrum.position_m
+    x -= 10e-12 * (spectrum.time_ns * 1e-9 - EPOCH_S)
+    return math.sin(x / 70e-9) + math.cos(y / 60e-9)
+
+
+@pytest.mark.parametrize("drift", [True, False])
+def test_map_follows_a_drift_unless_it_is_switched_off(
+    drift: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level("INFO"):
+        component = adaptive("drifting_waves", until={"spectra": 130}, drift=drift)
+        run(component, Lab("map"), tmp_path / "state", run_dir=str(tmp_path))
+    moved = [abs(float(row["x [m]"]) - float(row["x_start [m]"])) for row in table(tmp_path)]
+    assert (max(moved) > 1e-9) is drift
+    assert ("the map follows it" in caplog.text) is drift
 
 
 def test_map_without_any_value_ends_the_component(tmp_path: Path) -> None:

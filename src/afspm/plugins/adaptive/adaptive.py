@@ -58,6 +58,8 @@ class Adaptive(Component):
         coarsest: number of positions along the longer side of the first lattice, 3 to 9.
         levels: number of refinements, 1 to 9, each twice as fine as the last; those after the third are measured only
             between measured positions.
+        drift: whether the map follows a drift of the sample, found from the values; false where it is corrected or far
+            smaller than the finest spacing, since a drift may be found where there is none.
         keep_control: whether to keep control between spectra; by default others may measure meanwhile.
         end_when_done: whether to end the whole experiment after the last spectrum.
         file: name of table and picture, without suffix.
@@ -81,6 +83,7 @@ class Adaptive(Component):
         optimizer: str = "adaptive",
         coarsest: int = 5,
         levels: int = 5,
+        drift: bool = True,
         keep_control: bool = False,
         end_when_done: bool = False,
         file: str = "map",
@@ -91,7 +94,11 @@ class Adaptive(Component):
         self._region = Region((center[0], center[1]), (size[0], size[1]), angle)
         self._evaluation = evaluation(quantity, unit, kind)
         self._until = Until.of(until, self._evaluation.unit)
-        own = {"coarsest": coarsest, "levels": levels} if optimizer in ("adaptive", "nested") else {}
+        own: dict[str, Any] = {}
+        if optimizer in ("adaptive", "nested"):
+            own = {"coarsest": coarsest, "levels": levels, "velocity_m_s": None if drift else (0.0, 0.0)}
+        elif not drift:
+            raise ConfigError("is a setting of the optimisers of afspm", where="drift", hint="leave it out")
         self._optimizer = optimizer_of(optimizer, self._region, self._evaluation.name, **own)
         self.kind = self._evaluation.kind
         with_kind = (names.SPEC_KIND,) if self.kind else ()
@@ -102,6 +109,7 @@ class Adaptive(Component):
         self.positions = tuple((float(x), float(y)) for x, y in self._region.corners_m())
         self.keep_control, self.end_when_done, self.file = keep_control, end_when_done, file
         self._progress: MapProgress | None = None
+        self._velocity = (0.0, 0.0)
 
     def planned_work(self, speed_m_s: float | None) -> PlannedWork:
         most = self._until.spectra or MOST_SPECTRA
@@ -184,6 +192,11 @@ class Adaptive(Component):
         done, until = len(found.measured), self._until
         most = until.spectra or MOST_SPECTRA
         self.scope.progress(done, most)
+        velocity = found.map.parameters.velocity_m_s
+        if velocity != self._velocity and any(velocity):
+            by = " and ".join(quantity(each, "m/s", 2) for each in velocity)
+            self.log.info("the values contradict each other less with a drift of %s (x and y): the map follows it", by)
+        self._velocity = velocity
         every = max(1, most // MOST_LINES)
         if done and done % every == 0:
             self.log.info("%s", self._state(found))
