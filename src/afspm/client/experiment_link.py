@@ -178,9 +178,9 @@ class RequestTracker:
         """Choose the request whose answer `answer` will hold; an empty id chooses none."""
         self._asked, self.answer = request_id, None
 
-    def send_only(self, kind: int, subject: object = None) -> str:
+    def send_only(self, kind: int, subject: object = None, request_id: str = "") -> str:
         """Send a request without waiting for its answer, and return its id."""
-        request = Request(kind, subject, id=self.next_id())
+        request = Request(kind, subject, id=request_id or self.next_id())
         self._send(wire.encode_request(request))
         return request.id
 
@@ -456,9 +456,9 @@ class ExperimentLink:
             hint="the request may or may not have been carried out",
         )
 
-    def send_only(self, kind: int, subject: object = None) -> None:
+    def send_only(self, kind: int, subject: object = None, request_id: str = "") -> None:
         """Send a request without waiting for the answer; without a connection the request is lost."""
-        self.requests.send_only(kind, subject)
+        self.requests.send_only(kind, subject, request_id)
 
     def relay(self, thing: object) -> None:
         """Ask the scheduler to publish a message of this component, without waiting."""

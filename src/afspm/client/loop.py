@@ -242,10 +242,12 @@ class ComponentLoop:
             if envelope is not None:
                 what = f"{name} is relayed, and has the envelope {name}_{self._context.name}, not {envelope!r}"
                 raise ConfigError(what, where=self._context.name, hint="publish it without an envelope")
+            request_id = self._link.next_id()
             try:
-                self._component.scope.announce(message)
+                self._component.scope.announce(message, request_id)
             except ExperimentEnded:  # the last scan is handled after the end, and its results are recorded
-                self._link.send_only(RELAY_REQUEST, RelayedMessage(name, payload))
+                # with its id, since the end may have come after the request was sent
+                self._link.send_only(RELAY_REQUEST, RelayedMessage(name, payload), request_id)
             return
         if envelope is not None and wire.message_of(envelope) != name:
             raise ConfigError(

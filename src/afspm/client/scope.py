@@ -780,15 +780,18 @@ class Scope(ExperimentView):
             raise
         self._results.finish_note(key, is_written=True)
 
-    def announce(self, message: object) -> None:
+    def announce(self, message: object, request_id: str = "") -> None:
         """Ask the scheduler to publish a message whose declaration is `relayed`, and wait until it has done so.
 
         A message whose answer is lost with the connection is published again.
 
+        Args:
+            request_id: id of the request, for a caller that repeats it after an error; by default a new one.
+
         Raises:
             Refused: the message is not declared as `relayed`, or is longer than 256 KB.
         """
-        self._ask_scheduler(RELAY_REQUEST, RelayedMessage(*wire.encode(message)))
+        self._ask_scheduler(RELAY_REQUEST, RelayedMessage(*wire.encode(message)), request_id)
 
     def report_readings(self, report: InstrumentReadings) -> InstrumentOrders:
         """Report the values of this component's instrument, and return the orders for it.

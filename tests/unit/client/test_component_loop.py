@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 from client_lab import EPOCH_S, OTHER_REGION, REGION, Lab, Nothing, context_of, run
+from declared_messages import forget_afterwards
+from google.protobuf.wrappers_pb2 import UInt64Value
 
 from afspm import model, wire
 from afspm.basics.errors import ConfigError, ExperimentEnded, NoResponse, Refused
@@ -19,9 +21,11 @@ from afspm.basics.own_fault import OwnFault
 from afspm.client.component import Component
 from afspm.client.dispatch import MessageDispatcher
 from afspm.model import (
+    RELAY_REQUEST,
     ControlRequest,
     ControlResponse,
     Problem,
+    Request,
     Response,
     ResponseDetail,
     Scan,
@@ -624,3 +628,29 @@ def test_own_attribute_with_a_name_that_afspm_gives_is_refused(
 ) -> None:  # results X9
     with pytest.raises(ConfigError, match=f"has its own '{attribute}'"):
         run(kind(), lab)
+
+
+def test_relayed_message_that_meets_the_end_is_repeated_under_its_id(monkeypatch: pytest.MonkeyPatch) -> None:
+    forget_afterwards(monkeypatch)
+    wire.declare(wire.MessageDeclaration(type=UInt64Value, relayed=True))
+
+    class Counts(Component):
+        def on_scan(self, scan: Scan) -> None:
+            self.publish(UInt64Value(value=3))
+
+    lab = Lab("counts")
+    sent: list[str] = []
+
+    def ends_unanswered(request: Request) -> Response | str:
+        if request.kind == RELAY_REQUEST:
+            sent.append(request.id)
+            if len(sent) == 1:
+                lab.kill()  # the end comes after the request was sent, and before its answer
+                return "no answer"
+        return "go on"
+
+    lab.intercept = ends_unanswered
+    lab.at(1.0, lambda: lab.publish_scan(REGION))
+    assert run(Counts(), lab) == ExitCode.ENDED
+    assert len(sent) >= 2
+    assert sent[0] == sent[1], "with another id it would be published twice"
