@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from afspm import wire
 from afspm.basics.errors import ControlLost, InvalidValue, NoResponse, Refused
 from afspm.basics.plain_data import Plain
@@ -111,6 +109,8 @@ class PlacedSweeper:
         return result
 
     def _measure(self, sweep: PlacedSweep, until_s: float | None) -> tuple[Spectrum, MeasurementConditions]:
+        import numpy as np  # late: most components sweep nothing, and it takes a tenth of a second
+
         link, target = self._link, sweep.target
         if target.at_m is not None:
             self._setup.move_probe(target.at_m, until_s, drifts=target.frame is Frame.SAMPLE)
