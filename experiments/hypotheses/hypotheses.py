@@ -7,7 +7,7 @@ from decision_picture import draw
 from spots import difference, judged
 
 from afspm import Component
-from afspm.basics import Length
+from afspm.basics import InvalidValue, Length
 from afspm.plugins.adaptive.quantities import gap_ev
 
 
@@ -24,16 +24,24 @@ class Hypotheses(Component):
         self.size, self.first, self.probability, self.most = size, first, probability, most
 
     def run(self):
-        places, gaps, candidates = lattice(self.first), [], lattice(25)
+        wanted, candidates = lattice(self.first), lattice(25)
+        places, gaps, curves = [], [], 0
         while True:
-            for x, y in self.size * places[len(gaps) :]:
-                curve = self.scope.spectrum((float(x), float(y)), kind="IV", key=f"curve-{len(gaps) + 1}")
-                gaps.append(gap_ev(curve))
-            better, probability, fits = judged(places, np.array(gaps))
+            for x, y in wanted:
+                curves += 1
+                at = (self.size * float(x), self.size * float(y))
+                curve = self.scope.spectrum(at, kind="IV", key=f"curve-{curves}")
+                try:
+                    gaps.append(gap_ev(curve))
+                    places.append((x, y))
+                except InvalidValue as unclear:
+                    self.log.info("curve %d is left out: %s", curves, unclear.what)
+                    candidates = candidates[np.hypot(*(candidates - (x, y)).T) > 1e-9]
+            better, probability, fits = judged(np.array(places), np.array(gaps))
             self.log.info("%d curves: %s, with a probability of %.3f", len(gaps), better, probability)
-            if probability >= self.probability or len(gaps) >= self.most:
+            if probability >= self.probability or curves >= self.most:
                 break
-            places = np.vstack([places, candidates[difference(fits, candidates).argmax()]])
+            wanted = candidates[[difference(fits, candidates).argmax()]]
         ground, change, x, y, half_width = map(float, fits[better])
         decision = {
             "decision": better if probability >= self.probability else "undecided", "probability": probability,
@@ -42,5 +50,5 @@ class Hypotheses(Component):
         }  # fmt: skip
         (self.run_dir / "decision.json").write_text(json.dumps(decision, indent=2), encoding="utf-8")
         title = f"{decision['decision']}, probability {probability:.3f}" + ", SIMULATED" * self.simulated
-        draw(self.run_dir / "decision.png", title, 1e9 * self.size, places, gaps, fits, better)
+        draw(self.run_dir / "decision.png", title, 1e9 * self.size, np.array(places), gaps, fits, better)
         self.scope.end_experiment()

@@ -38,6 +38,7 @@ IMPOSSIBLE = "not possible: "
 ELSEWHERE = {
     "Instrument": "speaks to another instrument, not to the microscope",
     "Notifier": "speaks to a person, not to the microscope",
+    "SweepAt": "needs an instrument beside it: tests/system/experiment/test_sweep_at_runs.py",
     "TraceReplay": "stands in for a controller",
 }
 """Components that have no job here, and why."""

@@ -58,7 +58,7 @@ _MOST_ALIKE: Final = 0.98
 _STAYS: Final = 0.999
 """Share of the largest current above which `_LEAST_CLIPPED` points prove a saturation: the current rises no more."""
 _LEAST_CLIPPED: Final = 4
-_MOST_ERROR: Final = 0.1
+_MOST_ERROR: Final = 0.25
 """Largest standard error of the gap, as a share of it."""
 _EXCLUDED: Final = 25.0
 """By how much the sum of squares of a density is larger, in variances, that the noise excludes."""
@@ -88,7 +88,7 @@ def band_gap(spectrum: Spectrum) -> BandGap:
 
     Raises:
         NoSuchItem: the spectrum has no bias, or neither conductance nor current. InvalidValue: it shows no gap, or the
-            gap is known to less than a tenth.
+            gap is known to less than a quarter.
     """
     curve = _Curve.of(spectrum)
     densities = [*(_bands(onset, curve) for onset in _ONSETS), _superconductor(curve)]

@@ -17,8 +17,11 @@ from afspm.testing.translators.translator_suite import TRANSLATOR_SUITE
 
 _LAST = (names.SCAN_SPEED, names.MOVE_SPEED)
 """Settings restored last, since a change of the frame may change them."""
-_REPORTED = (names.CONTROLLER, names.SAFE_TIP_ON, names.SAFE_TIP_THRESHOLD)
-"""Parameters that a person may change meanwhile, and that no request can set."""
+_REPORTED = (
+    names.CONTROLLER, names.SAFE_TIP_ON, names.SAFE_TIP_THRESHOLD, names.TIP_Z, names.CURRENT, names.FREQUENCY_SHIFT,
+    names.Z_IS_HELD,
+)  # fmt: skip
+"""Parameters that are measured, or that a person may change meanwhile: no request can set them."""
 
 
 @dataclass(frozen=True)
