@@ -60,9 +60,6 @@ class ComponentLoop:
         self._ticker = None if self._is_script else _ticker(component, self._clock)
         self._link = ExperimentLink.of_launch(launch, port, context.session, activity=self._activity, log=context.log)
         self._link.listen(self._keep)
-        self._began_ns, self._conditions = self._clock.now_ns(), dict[str, ProcessCondition]()
-        if launch.after:
-            self._link.listen(self._note_ends)
         self._state_dir = Path(launch.state_dir) if launch.state_dir else None
         self._give_attributes(self._state_dir)
 
@@ -139,26 +136,27 @@ class ComponentLoop:
     def _await_others(self, names: tuple[str, ...]) -> None:
         if not names:
             return
-        if left := [name for name in names if name not in self._conditions]:
-            self._context.log.info("begins when %s is done", " and ".join(names))
-            with self._clock.passing():
-                self._link.wait(lambda: not any(name not in self._conditions for name in left))
-        for name in names:
-            if self._conditions[name] is ProcessCondition.GIVEN_UP:
-                self._context.log.warning("%s was given up; beginning all the same", name)
+        began_ns, ends = self._clock.now_ns(), dict[str, ProcessCondition]()
 
-    def _note_ends(self, packet: Packet, ours: bool) -> None:
-        # of the components in `after`; a process that is started again is not done
-        if packet.envelope.partition("_")[0] != ProcessStates.__name__:
-            return
-        states = wire.decode(ProcessStates.__name__, packet.payload)
-        if states.time_ns < self._began_ns:
-            return  # kept since before the run was resumed, with processes that the stop has ended
-        for one in states.processes:
-            if one.condition in (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP):
-                self._conditions[one.name] = one.condition
-            else:
-                self._conditions.pop(one.name, None)
+        def note(packet: Packet, ours: bool) -> None:
+            if packet.envelope.partition("_")[0] != ProcessStates.__name__:
+                return
+            states = wire.decode(ProcessStates.__name__, packet.payload)
+            if states.time_ns < began_ns:
+                return  # kept since before the run was resumed, with processes that the stop has ended
+            for one in states.processes:
+                ends.pop(one.name, None)  # a process that is started again is not done
+                if one.condition in (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP):
+                    ends[one.name] = one.condition
+
+        self._context.log.info("begins when %s is done", " and ".join(names))
+        with contextlib.ExitStack() as stack:
+            stack.callback(self._link.listen(note))
+            stack.enter_context(self._clock.passing())
+            self._link.wait(lambda: ends.keys() >= {*names})
+        for name in names:
+            if ends[name] is ProcessCondition.GIVEN_UP:
+                self._context.log.warning("%s was given up; beginning all the same", name)
 
     def _stop_all_measurements(self, failed: MeasurementFailed) -> None:
         # the flag keeps all components from measuring: a restarted component would repeat the failing scan without end

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from afspm.basics.errors import ControlLost
 from afspm.client.command_retry import CommandRetry
+from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import PublishedState
 from afspm.client.instrument_targets import InstrumentTargets
 from afspm.client.targets import FITS, SAME, XY, ScanTarget, Target, is_set
@@ -32,9 +33,15 @@ class MeasurementSetup:
     """
 
     def __init__(
-        self, view: PublishedState, commands: CommandRetry, targets: InstrumentTargets, withdrawal: Withdrawal
+        self,
+        view: PublishedState,
+        control: ControlHold,
+        commands: CommandRetry,
+        targets: InstrumentTargets,
+        withdrawal: Withdrawal,
     ) -> None:
         self._view = view
+        self._control = control
         self._commands = commands
         self._targets = targets
         self._withdrawal = withdrawal
@@ -49,7 +56,8 @@ class MeasurementSetup:
         if not target.withdraws:
             return tuple(self._targets.reach(one, until_s) for one in others)
         try:
-            with self._withdrawal.unbroken(until_s):
+            # after a loss of control others may move the tip: nothing in the block goes on
+            with self._control.hold(until_s=until_s, unbroken=True):
                 if not all(self._targets.is_reached(one, until_s) for one in others):
                     self._withdrawal.withdraw(until_s)
                 reached = tuple(self._targets.reach(one, until_s) for one in others)

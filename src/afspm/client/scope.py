@@ -121,7 +121,7 @@ class Scope(ExperimentView):
         self._targets = InstrumentTargets(link, self._control, self._commands)
         self._results = KeyedResults(state_dir, link.name)
         self._withdrawal = Withdrawal(link, self._control, self._commands, self._results)
-        self._setup = MeasurementSetup(link.view, self._commands, self._targets, self._withdrawal)
+        self._setup = MeasurementSetup(link.view, self._control, self._commands, self._targets, self._withdrawal)
         self._runner = MeasurementRunner(link, self._control, self._commands, self._setup, self._results)
 
     # --- measuring ---
@@ -476,7 +476,7 @@ class Scope(ExperimentView):
     def _set_back_withdrawn(self, former: FormerValues, until_s: float | None) -> None:
         while True:
             try:
-                with self._withdrawal.unbroken(until_s):
+                with self._control.hold(until_s=until_s, unbroken=True):
                     self._withdrawal.withdraw(until_s)
                     former.set_back(until_s)
                     break

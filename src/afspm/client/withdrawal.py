@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 from afspm import wire
 from afspm.basics.errors import NoResponse, Refused
@@ -23,12 +22,6 @@ class Withdrawal:
         self, link: ExperimentLink, control: ControlHold, commands: CommandRetry, results: KeyedResults
     ) -> None:
         self._link, self._control, self._commands, self._results = link, control, commands, results
-
-    @contextmanager
-    def unbroken(self, until_s: float | None) -> Iterator[None]:
-        """Hold control in the block; after a loss of control nothing in it goes on, since others may move the tip."""
-        with self._control.hold(until_s=until_s, unbroken=True):
-            yield
 
     def withdraw(self, until_s: float | None) -> None:
         """Withdraw the tip. Control must be held.

@@ -174,14 +174,19 @@ class Sweep(Component):
             "parameters": tuple(axis.parameter(place) for axis in self.sweep.axes for place in range(len(axis.values))),
         }
 
+    @property
+    def _at_each(self) -> tuple[int, int]:
+        # the scans and the spectra of a point
+        scans, spectra = (max(len(places), 1) for places in (self.regions, self.positions))
+        return scans * (self.measure != "spectrum"), spectra * (self.measure != "scan")
+
     def planned_work(self, speed_m_s: float | None) -> PlannedWork:
         total, ends = self.sweep.total, self.end_when_done
-        spectra = 0 if self.measure == "scan" else total * max(len(self.positions), 1)
+        scans, spectra = (total * each for each in self._at_each)
         why = time_of_curves(self.curve, spectra)
         if self.measure == "spectrum":
             return PlannedWork(spectra=spectra, ends_experiment=ends, why=why)
         if not self.regions or self._shape is None:
-            scans = total * max(len(self.regions), 1)
             why = "the file sets no size and pixels"
             return PlannedWork(scans, spectra=spectra, path_m=None, pixels=None, ends_experiment=ends, why=why)
         speeds = next((axis.values for axis in self.sweep.axes if axis.name == names.SCAN_SPEED), (speed_m_s,))
@@ -205,8 +210,7 @@ class Sweep(Component):
                 where="parameters",
                 hint="undo the change, or begin a new run",
             )
-        scans = max(len(self.regions), 1) if self.measure != "spectrum" else 0
-        each = scans + (max(len(self.positions), 1) if self.measure != "scan" else 0)
+        each = sum(self._at_each)
         total, done = self.sweep.total * each, int(self.memory.get("done", 0))
         what = "point" if each == 1 else "measurement"
         pace = Pace(self.scope, self.memory)

@@ -6,6 +6,7 @@ import contextlib
 import inspect
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from graphlib import CycleError, TopologicalSorter
 from itertools import filterfalse
 from pathlib import Path
 from typing import Final
@@ -234,18 +235,13 @@ def _is_script(component: type) -> bool:
 
 
 def _ring(after: Mapping[str, Sequence[str]]) -> list[str]:
-    # the first circle, from its name that comes first in the file; empty without a circle
-    for start in after:
-        way, left = [start], [list(after[start])]
-        while left:
-            if not left[-1]:
-                way.pop()
-                left.pop()
-            elif (name := left[-1].pop(0)) == start:
-                return way
-            elif name in after and name not in way:
-                way.append(name)
-                left.append(list(after[name]))
+    # a circle, each after the next, from its name that comes first in the file; empty without a circle
+    try:
+        TopologicalSorter(after).prepare()
+    except CycleError as error:
+        found: list[str] = error.args[1][:0:-1]  # its last entry repeats the first, and each comes before the next
+        start = found.index(next(name for name in after if name in found))
+        return found[start:] + found[:start]
     return []
 
 

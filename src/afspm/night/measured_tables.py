@@ -228,7 +228,7 @@ def _with_settings(query: Query, table: str, rows: list[R]) -> list[R]:
     ends: dict[int, int] = dict(query(_PUBLISHED[table]))
     by_hand = _changed_by_hand(query)
     newest: dict[str, tuple[int, MeasurementSettings]] = {}
-    made: dict[int, tuple[tuple[SweptSetting, ...], int | None]] = {}
+    made: dict[int, R] = {}
     for end_ns, row in sorted(((ends.get(row.number, row.time_ns), row) for row in rows), key=itemgetter(0)):
         while published and published[-1][0] <= end_ns:
             with suppress(WireError):  # of a newer version
@@ -239,9 +239,8 @@ def _with_settings(query: Query, table: str, rows: list[R]) -> list[R]:
         if settings is not None and settings.key in ("", row.key):
             changed = {name for at_ns, name in by_hand if set_ns < at_ns <= end_ns}
             swept = tuple(_swept(one) for one in settings.parameters if one.name not in changed)
-            made[row.number] = swept, settings.point
-    kept = ((), None)
-    return [replace(row, settings=made.get(row.number, kept)[0], point=made.get(row.number, kept)[1]) for row in rows]
+            made[row.number] = replace(row, settings=swept, point=settings.point)
+    return [made.get(row.number, row) for row in rows]
 
 
 def _in_force(query: Query, rows: list[R]) -> list[R]:

@@ -123,20 +123,17 @@ class Instruments:
         Returns:
             The reason, if they are unknown.
         """
-        name, part = split(parameter)
-        if part == "busy":
-            reading = self.reading(name, now_s)
-            if reading.value is None:
-                return reading.reason or "it has no value"
-            is_busy = reading.busy or any(order.parameter == name for order in self.given)
-            return (Parameter(parameter, "true" if is_busy else "false"),)
-        reading = self.reading(parameter, now_s)
+        base, part = split(parameter)
+        name = base if part == "busy" else parameter
+        reading = self.reading(name, now_s)
         if reading.value is None:
             return reading.reason or "it has no value"
+        orders = [order.order.parameter for order in self.given if order.parameter == name]
+        if part == "busy":
+            return (Parameter(parameter, "true" if reading.busy or orders else "false"),)
         unit = reading.unit or "1"  # a parameter without a unit would be taken in the unit of the rule
         numbers = (reading.value,) if reading.target is None else (reading.value, reading.target)
         values = [Parameter(parameter, repr(number), unit) for number in numbers]
-        orders = [order.order.parameter for order in self.given if order.parameter == parameter]
         return tuple(dict.fromkeys((*values, *orders)))
 
     def reported(self, report: InstrumentReadings, now_s: float, now_ns: int) -> Instruments:
