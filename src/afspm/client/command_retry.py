@@ -12,6 +12,7 @@ from afspm.basics.errors import NoResponse, Refused
 from afspm.basics.formatting import day_and_time
 from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import ExperimentLink
+from afspm.client.parameter_text import Value, value_in
 from afspm.model import (
     RELAY_REQUEST,
     ControlRequest,
@@ -121,6 +122,14 @@ class CommandRetry:
             return response
         with self._control.hold(until_s=until_s):
             return self.send(kind, subject, until_s=until_s)
+
+    def value(self, parameter: str, unit: str | None, until_s: float | None) -> Value:
+        """Return a parameter's value, in the unit as for `value_in`. Raises Refused if it can't be read."""
+        asked = Parameter(parameter)
+        response = self.read(ControlRequest.PARAM, asked, until_s)
+        if not response.ok:
+            raise refused(ControlRequest.PARAM, response, parameter)
+        return value_in(response, asked, unit)
 
     def set(self, kind: ControlRequest, wanted: object, message: str, until_s: float | None) -> None:
         """Send a setting; wait until its `message` is published and the tip has stopped moving. Raises as `ask`.

@@ -6,7 +6,7 @@ from afspm.basics.errors import ControlLost
 from afspm.client.command_retry import CommandRetry, refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import ExperimentLink
-from afspm.client.parameter_text import Value, to_parameter, value_in
+from afspm.client.parameter_text import Value, to_parameter
 from afspm.model import ControlRequest, Parameter, ScopeState, names
 from afspm.model.instruments import newest_of
 
@@ -74,7 +74,7 @@ class HeldHeight:
         Raises:
             Refused: z is held no more; the reason says why.
         """
-        value = self._value(newest_of(parameter), unit)
+        value = self._commands.value(newest_of(parameter), unit, self._until_s)
         self.check()
         return value
 
@@ -82,7 +82,7 @@ class HeldHeight:
         """Raise Refused with the reason if z is held no more: a bound was reached, or the tip was withdrawn."""
         if self._control.was_lost:
             raise ControlLost(f"control was lost while z was held: {self._control.why_lost}", where=self._link.name)
-        if not self._value(names.Z_IS_HELD, None):
+        if not self._commands.value(names.Z_IS_HELD, None, self._until_s):
             self._end()
 
     def release(self) -> None:
@@ -94,7 +94,7 @@ class HeldHeight:
         if not self._control.held:
             return
         self._end()
-        if not self._value(names.FEEDBACK_ON, None):
+        if not self._commands.value(names.FEEDBACK_ON, None, self._until_s):
             self._end()
 
     def _end(self) -> None:
@@ -109,9 +109,3 @@ class HeldHeight:
             self._link.wait(
                 lambda: view.count("ScopeStateMsg") != states and view.state is ScopeState.FREE, self._until_s
             )
-
-    def _value(self, name: str, unit: str | None) -> Value:
-        response = self._commands.read(ControlRequest.PARAM, Parameter(name), self._until_s)
-        if not response.ok:
-            raise refused(ControlRequest.PARAM, response, name)
-        return value_in(response, Parameter(name), unit)

@@ -545,11 +545,7 @@ class Scope(ExperimentView):
 
     def _get(self, parameter: str, unit: str | None, timeout_s: float | None) -> Value:
         with self._call():
-            asked = Parameter(parameter)
-            response = self._commands.read(ControlRequest.PARAM, asked, self._link.until(timeout_s))
-            if not response.ok:
-                raise refused(ControlRequest.PARAM, response, parameter)
-            return value_in(response, asked, unit)
+            return self._commands.value(parameter, unit, self._link.until(timeout_s))
 
     @checked_call
     def set_feedback(
