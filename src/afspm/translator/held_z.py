@@ -112,11 +112,15 @@ class HeldZ:
             raise Refused(ControlResponse.ACTION_ERROR, f"{action}: z is held no more: {why}")
 
     def refuse_setting(self, values: Mapping[str, Value]) -> None:
-        """Refuse to switch the feedback by hand while z is held.
+        """Refuse to switch the feedback while z is held, and a value meant for a hold that has ended by itself.
+
+        A bias for a held tip, set after the way back, would let the feedback drive the tip into the sample.
 
         Raises:
             Refused: PARAM_ERROR.
         """
+        if self._found is None and (why := self._kept.get(_ENDED)) and not values.keys().isdisjoint(_RESTORED):
+            raise Refused(ControlResponse.PARAM_ERROR, f"{', '.join(values)}: z is held no more: {why}")
         if self._found is not None and FEEDBACK_ON in values:
             raise Refused(ControlResponse.PARAM_ERROR, f"{FEEDBACK_ON}: z is held: {names.RELEASE_Z} switches it on")
 

@@ -141,10 +141,16 @@ def test_current_beyond_the_bound_ends_the_hold_with_the_reason(held: Any, bound
     assert lowest_m > z_m - 150e-12, "it has turned back long before the offset"
     assert get(held, names.FEEDBACK_ON) == "true"
     assert get(held, names.Z_IS_HELD) == "false"
+    bias = get(held, names.TIP_BIAS_VOLTAGE)
+    late = put(held, names.TIP_BIAS_VOLTAGE, 0.001)
+    assert late.code == ControlResponse.PARAM_ERROR, "the feedback is on, and a bias for a held tip comes late"
+    assert "z is held no more: x-current was" in late.reason
+    assert get(held, names.TIP_BIAS_VOLTAGE) == bias
     for what in (names.START_SCAN, names.RELEASE_Z):
         refused = act(held, what)
         assert refused.code == ControlResponse.ACTION_ERROR
         assert "z is held no more: x-current was" in refused.reason
+    assert put(held, names.TIP_BIAS_VOLTAGE, 0.2).ok
     assert act(held, names.START_SCAN).ok, "once the reason was given, the microscope is as any other"
 
 
