@@ -31,13 +31,18 @@ def go_on(
     feedback_off: Annotated[
         bool, typer.Option("--feedback-off", help="The z feedback is off because you want it so.")
     ] = False,
+    tip_is_clear: Annotated[
+        bool,
+        typer.Option("--tip-is-clear", help="You have retracted the tip far enough for lateral moves of the sample."),
+    ] = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Don't ask.")] = False,
 ) -> None:
     """Let a paused experiment continue: AUTOMATED, also after a person has acted at the microscope.
 
     Shows why it is paused and how the tip is, and then asks. It is refused while the tip is withdrawn, or the feedback
     off, by hand; `--feedback-off` lets it measure without feedback, until a request of the run or a person switches it
-    on. The experiment must be running: after a kill or a power cut use `afspm run --resume RUN`.
+    on. `--tip-is-clear` allows lateral moves of a stage until the next approach. The experiment must be running: after
+    a kill or a power cut use `afspm run --resume RUN`.
     """
     from afspm.model import ControlMode, TipStatus
 
@@ -50,6 +55,9 @@ def go_on(
     if feedback_off:
         with acting(where) as scope:
             scope.feedback_may_be_off()
+    if tip_is_clear:
+        with acting(where) as scope:
+            scope.tip_is_clear()
     _set_mode(where, ControlMode.AUTOMATED, "the experiment goes on (AUTOMATED)")
 
 

@@ -59,9 +59,9 @@ class MeasurementSetup:
             # after a loss of control others may move the tip: nothing in the block goes on
             with self._control.hold(until_s=until_s, unbroken=True):
                 if not all(self._targets.is_reached(one, until_s) for one in others):
-                    self._withdrawal.withdraw(until_s)
+                    self._withdrawal.withdraw(until_s, target.away)
                 reached = tuple(self._targets.reach(one, until_s) for one in others)
-                self._withdrawal.bring_back(until_s)
+                self._withdrawal.bring_back(until_s, approaches=bool(target.away))
         except ControlLost:
             return ()  # the measurement begins again, with its targets
         return reached

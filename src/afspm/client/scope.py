@@ -30,7 +30,7 @@ from afspm.client.parameter_text import Value, to_parameter, value_in
 from afspm.client.sweeping import Measure, ParameterSweep, SweepPoint, values_between
 from afspm.client.sweeping_at import PlacedSweep, PlacedSweeper
 from afspm.client.targets import ScanTarget, SpectrumTarget, Target, xy_of
-from afspm.client.withdrawal import Withdrawal
+from afspm.client.withdrawal import APPROACH_S, Withdrawal
 from afspm.model import (
     CLOCK_REQUEST,
     GRANT_REQUEST,
@@ -269,7 +269,7 @@ class Scope(ExperimentView):
         order: SweepOrder = "snake",
         seed: int = 0,
         repeat: int = 1,
-        withdraw: bool = False,
+        withdraw: bool | Sequence[str] = False,
         key: str | None = None,
         done: int = 0,
         timeout_s: float | None = None,
@@ -297,7 +297,8 @@ class Scope(ExperimentView):
             seed: seed of the random order.
             repeat: number of points with the same values, one after the other.
             withdraw: whether the tip is withdrawn while another instrument goes to its target. It then stays withdrawn
-                when the instruments are set back at the end.
+                when the instruments are set back at the end. A list of actions moves the tip away besides, as a lateral
+                move of a stage needs it; then it is brought back by an `approach`.
             key: name of the sweep, whose measurements are then taken only once in this run, under the keys "<key>-1",
                 "<key>-2" …
             done: number of points to skip at the beginning.
@@ -320,12 +321,14 @@ class Scope(ExperimentView):
             raise InvalidValue(
                 "a sweep measures nothing at its points", where="sweep", hint="list a region or position"
             )
-        targets = [replace(one, withdraws=withdraw) for one in targets]
+        away = () if isinstance(withdraw, bool) else tuple(withdraw)
+        targets = [replace(one, withdraws=bool(withdraw), away=away) for one in targets]
         key = key and check_key(key)
         former = self._former([axis.name for axis in plan.axes], key, partial(values_between, plan))
         sweep = ParameterSweep(plan, targets, key, former, runner=self._runner, results=self._results)
         until_s = self._link.until(timeout_s)
-        with self._control.hold(until_s=until_s, keeps=True), self._setting_back(former, timeout_s, withdraw=withdraw):
+        aside = away if withdraw else None
+        with self._control.hold(until_s=until_s, keeps=True), self._setting_back(former, timeout_s, aside):
             self._sweeps = True
             try:
                 yield self._each_in_a_call(sweep.points(done, until_s))
@@ -449,7 +452,10 @@ class Scope(ExperimentView):
             yield point
 
     @contextmanager
-    def _setting_back(self, former: FormerValues, timeout_s: float | None, withdraw: bool = False) -> Iterator[None]:
+    def _setting_back(
+        self, former: FormerValues, timeout_s: float | None, aside: tuple[str, ...] | None = None
+    ) -> Iterator[None]:
+        # aside: the tip is withdrawn for it, and moved away by these actions
         try:
             yield
         except (ExperimentEnded, StopRequested):
@@ -457,27 +463,27 @@ class Scope(ExperimentView):
             raise
         except BaseException:  # also Ctrl-C, and what the block of the user raises
             with suppress(RequestError):  # logged; the first error says more
-                self._set_back(former, SET_BACK_WITHIN_S, withdraw)
+                self._set_back(former, SET_BACK_WITHIN_S, aside)
             raise
-        self._set_back(former, timeout_s, withdraw)
+        self._set_back(former, timeout_s, aside)
 
-    def _set_back(self, former: FormerValues, timeout_s: float | None, withdraw: bool) -> None:
+    def _set_back(self, former: FormerValues, timeout_s: float | None, aside: tuple[str, ...] | None) -> None:
         try:
             with self._call():
                 until_s = self._link.until(timeout_s)
-                if withdraw and former.left_behind:
-                    self._set_back_withdrawn(former, until_s)
+                if aside is not None and former.left_behind:
+                    self._set_back_withdrawn(former, aside, until_s)
                 else:
                     former.set_back(until_s)
         except (RequestError, ExperimentEnded, StopRequested):
             self._log_left_behind(former)
             raise
 
-    def _set_back_withdrawn(self, former: FormerValues, until_s: float | None) -> None:
+    def _set_back_withdrawn(self, former: FormerValues, away: tuple[str, ...], until_s: float | None) -> None:
         while True:
             try:
                 with self._control.hold(until_s=until_s, unbroken=True):
-                    self._withdrawal.withdraw(until_s)
+                    self._withdrawal.withdraw(until_s, away)
                     former.set_back(until_s)
                     break
             except ControlLost:
@@ -601,14 +607,54 @@ class Scope(ExperimentView):
             self._commands.in_control(ControlRequest.ACTION, name, self._link.until(timeout_s))
 
     @checked_call
+    def withdraw(self, *away: str, timeout_s: float | None = None) -> None:
+        """Withdraw the tip, and move it away by the actions `away`, one after the other. Control must be held.
+
+        The microscope shows the tip as withdrawn afterwards. `approach` brings it back.
+
+        Raises:
+            Refused: the microscope refuses, or shows the tip at the sample. NoResponse: it is not free in time.
+        """
+        with self._call():
+            self._withdrawal.away(away, self._link.until(timeout_s))
+
+    @checked_call
+    def approach(self, *, timeout_s: float = APPROACH_S) -> None:
+        """Bring the tip to the sample, and return when it has been read there twice, a second apart.
+
+        The microscope's approach by the coarse motor (`x-approach`) is used, where there is one, otherwise `x-engage`.
+        Control must be held.
+
+        Args:
+            timeout_s: real time after which the approach is given up; then the tip is withdrawn.
+
+        Raises:
+            Refused: the microscope refuses, or the tip is not at the sample; then it is withdrawn.
+            NoResponse: the approach was given up.
+        """
+        with self._call():
+            self._withdrawal.approach(self._link.until(timeout_s))
+
+    @checked_call
+    def tip_is_clear(self, *, timeout_s: float | None = ANSWER_S) -> None:
+        """Say, for a person, that the tip is far enough from the sample for lateral moves, until it approaches again.
+
+        Raises:
+            Refused: as `feedback_may_be_off`.
+        """
+        self._say(names.TIP_IS_CLEAR, timeout_s)
+
+    @checked_call
     def feedback_may_be_off(self, *, timeout_s: float | None = ANSWER_S) -> None:
         """Say, for a person, that the z feedback is off by intention; needs no control, and the mode MANUAL.
 
         Raises:
             Refused: the mode is not MANUAL, or this client speaks for no person with the role `approve`.
         """
+        self._say(names.FEEDBACK_MAY_BE_OFF, timeout_s)
+
+    def _say(self, action: str, timeout_s: float | None) -> None:
         with self._call():
-            action = names.FEEDBACK_MAY_BE_OFF
             response = self._commands.send(ControlRequest.ACTION, action, until_s=self._link.until(timeout_s))
             if not response.ok:
                 raise refused(ControlRequest.ACTION, response, action)

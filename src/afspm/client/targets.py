@@ -32,6 +32,7 @@ class ScanTarget:
         settings: parameters of a sweep, set before each attempt.
         point: number of the sweep's point; None outside of a sweep.
         withdraws: whether the tip is withdrawn while another instrument goes to its target.
+        away: the actions that move it away then, before the instrument goes.
     """
 
     region: Region | None
@@ -39,6 +40,7 @@ class ScanTarget:
     settings: tuple[Parameter, ...] = ()
     point: int | None = None
     withdraws: bool = False
+    away: tuple[str, ...] = ()
 
     what: ClassVar = "scan"
     action: ClassVar = names.START_SCAN
@@ -99,6 +101,7 @@ class SpectrumTarget:
         settings: parameters of the curve or of a sweep, set before each attempt.
         point: number of the sweep's point; None outside of a sweep.
         withdraws: whether the tip is withdrawn while another instrument goes to its target.
+        away: the actions that move it away then, before the instrument goes.
     """
 
     at_m: XY | None
@@ -107,6 +110,7 @@ class SpectrumTarget:
     settings: tuple[Parameter, ...] = ()
     point: int | None = None
     withdraws: bool = False
+    away: tuple[str, ...] = ()
 
     what: ClassVar = "spectrum"
     action: ClassVar = names.START_SPEC
@@ -147,7 +151,11 @@ Target = ScanTarget | SpectrumTarget
 
 def _facts(target: Target) -> Plain:
     facts = to_plain(target)
-    del facts["point"], facts["withdraws"]  # the key has the number; how a target is reached changes no result
+    del (
+        facts["point"],
+        facts["withdraws"],
+        facts["away"],
+    )  # the key has the number; how a target is reached changes no result
     if not target.settings:
         del facts["settings"]
     return {"what": target.what, **facts}

@@ -72,7 +72,8 @@ class Sweep(Component):
         seed: seed of the random order.
         repeat: number of points with the same values, one after the other.
         withdraw: whether the tip is withdrawn while another instrument, such as a cryostat, goes to its target. At the
-            end it then stays withdrawn.
+            end it then stays withdrawn. A list of actions, such as ["COARSE_OUT"], moves the tip away besides, as a
+            lateral move of a stage needs it; then it is brought back by an approach.
         size: (width, height) of the scans; by default the present region.
         center: (x, y) of the middle of the scans; (0, 0) if not given.
         angle: angle of the scans, counter-clockwise; 0 if not given.
@@ -93,7 +94,7 @@ class Sweep(Component):
         order: SweepOrder = "snake",
         seed: int = 0,
         repeat: int = 1,
-        withdraw: bool = False,
+        withdraw: bool | list[str] = False,
         size: tuple[Length, Length] | None = None,
         center: tuple[Length, Length] | None = None,
         angle: Angle | None = None,
@@ -148,7 +149,8 @@ class Sweep(Component):
         self.curve = curve or {}
         self._of_curves = curve_parameters(self.curve, kind)
         starts = {"scan": (names.START_SCAN,), "spectrum": (names.START_SPEC,)}
-        of_tip = (names.RETRACT, names.ENGAGE) if withdraw else ()
+        of_tip: tuple[str, ...] = (names.RETRACT, names.ENGAGE) if withdraw else ()
+        of_tip += () if isinstance(withdraw, bool) else tuple(withdraw)
         self.needs_actions = (*starts.get(measure, (names.START_SCAN, names.START_SPEC)), *of_tip)
         with_kind = bool(kind or self.curve)  # the settings of `curve` are those of one kind
         fixed = (

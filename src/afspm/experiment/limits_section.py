@@ -18,6 +18,11 @@ only = ["tip_corrector"]
 only = ["tip_corrector"]
 every = "10 min"
 
+[limits.movers]
+retraction = 40
+COARSE_OUT = { direction = "away", steps = 20, total = 2000 }
+COARSE_LEFT = { direction = "lateral", steps = 10, total = 500 }
+
 [limits.roles.agent]
 actions = ["start-scan", "start-spec"]
 region = { x = ["-2 um", "2 um"], y = ["-2 um", "2 um"] }
@@ -32,7 +37,7 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeGuard, get_args
 
 import pydantic
 
@@ -52,6 +57,7 @@ from afspm.scheduler import ExperimentLimits
 from afspm.scheduler.safety import rule_language
 from afspm.scheduler.safety.forbidden_states import NEVER_REFUSED, STATES
 from afspm.scheduler.safety.limits import ForbiddenState, Limit, RoleLimits, bounds, limit_key
+from afspm.scheduler.safety.movers import Direction, Mover, MoverSettings
 from afspm.scheduler.safety.rule_language import RuleComparison, RuleError, RuleSwitch, RuleTree
 
 Quantity = str | float
@@ -94,7 +100,9 @@ _SWEPT: Final = (
     *(names.TIP_BIAS_VOLTAGE, names.BIAS_OF_SAMPLE, *names.SPEC_ENDS, *names.SPEC_Z_ENDS),
     *(names.SPEC_Z_OFFSET, names.LOCK_IN_AMPLITUDE),
 )
-_OWN: Final = (*LimitsSection.model_fields, "actions", "roles", "forbid")
+_OWN: Final = (*LimitsSection.model_fields, "actions", "roles", "forbid", "movers")
+_DIRECTIONS: Final = get_args(Direction)
+_OF_MOVER: Final = ("direction", "steps", "total")
 _TYPES: Final = {
     **dict.fromkeys((names.FEEDBACK_ON, names.ENGAGED), "bool"),
     **dict.fromkeys((names.SPEC_KIND, names.SCAN_DIRECTION, names.CONTROLLER), "text"),
@@ -142,14 +150,16 @@ class LimitsReader:
             actions = {}
         given = {name: limit for name, keys in parameters.items() if (limit := self._parameter(name, keys))}
         read = self._by_canonical_name(given, "limits")
+        movers = self._movers(table.get("movers", {}), read)
         limits = ExperimentLimits(
             parameters=read,
             actions={name: limit for name, keys in actions.items() if (limit := self._action(name, keys))},
             **self._bounds(whole, table),
             sets={action: parameters for action, parameters in self.sets.items() if parameters},
             roles=self._roles(table.get("roles", {}), read),
-            forbid=self._forbid(table.get("forbid", [])),
+            forbid={**self._rules_of(movers), **self._forbid(table.get("forbid", []))},
             bias=self.bias,
+            movers=movers,
         )
         self._check_sizes(limits)
         return limits
@@ -351,6 +361,66 @@ class LimitsReader:
         hint = nearest(name, [*known, *STATES])
         raise RuleError(f"there is no parameter, instrument's parameter or state {name!r}", at, hint)
 
+    def _movers(self, table: object, limits: Mapping[str, Limit]) -> MoverSettings:
+        path = ("limits", "movers")
+        if not isinstance(table, Mapping):
+            self.document.error("[limits] movers is not a table", *path)
+            return MoverSettings()
+        given = {
+            name: one
+            for name, keys in table.items()
+            if name != "retraction"
+            if (one := self._mover(name, keys, limits))
+        }
+        retraction, is_lateral = table.get("retraction"), any(one.direction == "lateral" for one in given.values())
+        if (retraction is not None or is_lateral) and not _is_count(retraction):
+            what = "[limits.movers] retraction is the number of steps away from the sample before a lateral move"
+            hint = "e.g. retraction = 40; the withdrawal by the piezo, 1 to 2 um, is too little"
+            self.document.error(what, *path, hint=hint)
+        if given and names.ENGAGED not in self._known_parameters and self.certain:
+            what = f"[limits.movers] this microscope never shows whether its tip is withdrawn ({names.ENGAGED})"
+            self.document.error(what, *path, hint="leave it out, and move by hand after `afspm pause`")
+        approach = names.APPROACH if names.APPROACH in self._known_actions else names.ENGAGE
+        source = str(self.document.place(*path, "retraction"))
+        return MoverSettings(given, retraction if _is_count(retraction) else 0, approach, source)
+
+    def _mover(self, name: str, table: object, limits: Mapping[str, Limit]) -> Mover | None:
+        path = ("limits", "movers", name)
+        is_action, of_instrument = name in self._known_actions, name in self._known_parameters and instrument_of(name)
+        if not is_action and not of_instrument:
+            hint = nearest(name, [*self._known_actions, *(one for some in self.instruments.values() for one in some)])
+            self.document.error(
+                f"[limits.movers] there is no action or instrument's parameter {name!r}", *path, hint=hint
+            )
+            return None
+        fields = self._table(table, path, _OF_MOVER)
+        if fields is None:
+            return None
+        direction: Any = fields.get("direction")
+        steps, limit = fields.get("steps"), limits.get(name)
+        if direction not in _DIRECTIONS or (not is_action and direction != "lateral"):
+            hint = f"one of {', '.join(_DIRECTIONS)}" if is_action else 'a parameter can go both ways: "lateral"'
+            self.document.error(f"[limits.movers.{name}] direction = {direction!r}", *path, "direction", hint=hint)
+            return None
+        if is_action != _is_count(steps) or (not is_action and steps is not None):
+            hint = "steps = 20" if is_action else "leave it out: it is for the actions of a motor"
+            self.document.error(f"[limits.movers.{name}] steps: the steps of one action", *path, hint=hint)
+            return None
+        if not is_action and (limit is None or limit.step is None):
+            what = f"[limits.movers.{name}] a stage needs a longest way of one request"
+            self.document.error(what, *path, hint=f'write [limits."{name}"] step = "100 um"')
+            return None
+        unit = "" if is_action or limit is None else limit.unit or ""
+        total = self._in(fields.get("total"), "total", unit, path)
+        return None if total is None else Mover(direction, total, steps, unit, str(self.document.place(*path)))
+
+    @staticmethod
+    def _rules_of(movers: MoverSettings) -> dict[str, ForbiddenState]:
+        rules = [(name, f"{rule_language.change_of(name)} and {names.ENGAGED}") for name in movers.movers]
+        stages = [name for name, mover in movers.movers.items() if mover.steps is None]
+        rules += [(one, f"{rule_language.change_of(act)} and {one}.busy") for one in stages for act in names.APPROACHES]
+        return {rule: ForbiddenState(rule, source=movers.movers[name].source) for name, rule in rules}
+
     def _roles(self, table: object, limits: Mapping[str, Limit]) -> dict[str, RoleLimits]:
         if not isinstance(table, Mapping):
             self.document.error("[limits] roles is not a table", "limits", "roles")
@@ -492,6 +562,10 @@ def _unit_given(given: Table, as_unit: Callable[[str], str]) -> str | None:
                 if unit := as_unit(over if key == "rate" and slash else written):
                     return unit
     return None
+
+
+def _is_count(value: object) -> TypeGuard[int]:
+    return isinstance(value, int) and not isinstance(value, bool) and value > 0
 
 
 def _has_unit(value: object) -> bool:

@@ -16,19 +16,25 @@ PULSE: Final = "x-pulse"
 CRASH: Final = "x-crash"
 RETRACT: Final = "x-retract"
 ENGAGE: Final = "x-engage"
+APPROACH: Final = "x-approach"
+"""Bring the tip to the sample with the coarse motor, from any distance."""
 
 FEEDBACK_MAY_BE_OFF: Final = "x-feedback-may-be-off"
 """A person says that the z feedback is off by intention; every translator takes it, in the mode MANUAL alone."""
+
+TIP_IS_CLEAR: Final = "x-tip-is-clear"
+"""A person says that the tip is far enough from the sample for a lateral move; the scheduler takes it, in MANUAL."""
 
 HOLD_Z: Final = "x-hold-z"
 """Switch the z feedback off to hold z; every translator takes it whose driver can move z then."""
 RELEASE_Z: Final = "x-release-z"
 """The way back from `HOLD_Z`: height, bias, setpoint and gains as before it, then the feedback on."""
 
-EXTENSION_ACTIONS: Final = (PULSE, CRASH, RETRACT, ENGAGE)
+EXTENSION_ACTIONS: Final = (PULSE, CRASH, RETRACT, ENGAGE, APPROACH)
 OF_HELD_Z_ACTIONS: Final = (HOLD_Z, RELEASE_Z)
 
 TREATMENTS: Final = (PULSE, CRASH)
+APPROACHES: Final = (ENGAGE, APPROACH)
 AT_PROBE: Final = frozenset({START_SPEC, *TREATMENTS})
 """The actions that take place at the probe position."""
 

@@ -31,6 +31,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -50,6 +51,11 @@ Doing = ScanActivity | SpectrumActivity | Occupied
 _MOST_AVERAGED = 32  # more sweeps reduce the noise no further
 _PRESSED_M_PER_S = 10e-9  # by a ramp or a feedback, of a tip that meets the sample
 _FASTEST_DRIFT_M_S = 1e-6
+_APPROACH_M_PER_S = 1e-6
+_STEP_SPREAD = 0.3  # of a step of the motor, relative: no two go equally far
+_REACH_M = 1e-6  # of the z piezo, beyond the height at which the motor has left the tip
+_RUN_OUT_M = 2e-6  # how far a lateral step may lift the sample towards the tip; simulated, without a source
+_STRUCK_M, _STRUCK_M_PER_S = 50e-9, 1e-6  # a tip that the motor drives into the sample
 _FEW = (2, 2)  # pixels: enough to find the channels
 _STATE_VERSION = 2
 
@@ -105,6 +111,8 @@ class InstrumentState:
     ledger: DamageLedger
     scanned: list[ScannedPlace]
     held_until_s: float | None = None
+    coarse_m: float = 0.0
+    lands_s: float | None = None
 
 
 class SimulatedInstrument:
@@ -121,11 +129,15 @@ class SimulatedInstrument:
         setup: the present settings.
         drawing: the computation of scans.
         engaged: True while the tip is at the sample; otherwise all channels show noise.
+        coarse_m: how far the coarse motor has moved the tip away since the last approach.
         scan, spectrum: the last started scan and spectrum, also after their end; None before the first, and for a
             stopped spectrum.
         world: the physics, with its ground truth (`world.truth`).
         damage: the count of the damage so far.
+        coarse_step_s: duration of a step of the coarse motor.
     """
+
+    coarse_step_s: ClassVar[float] = 1e-3
 
     def __init__(
         self,
@@ -142,6 +154,8 @@ class SimulatedInstrument:
         self.setup = InstrumentSetup(self.world.settings.feedback)
         self.drawing = ScanDrawing(self.world, lambda: self.channels, seed, run)
         self.engaged = True
+        self.coarse_m = 0.0
+        self._lands_s: float | None = None
         self.scan: ScanActivity | None = None
         self.spectrum: SpectrumActivity | None = None
         self._doing: Doing | None = None
@@ -166,6 +180,8 @@ class SimulatedInstrument:
 
     def doing(self, now_s: float) -> str:
         """Return the activity: "scan", "spectrum", "move", or the name given to `occupy`; empty if free."""
+        if self._lands_s is not None and now_s >= self._lands_s:
+            self._lands_s, self.coarse_m, self.engaged = None, 0.0, True
         return self._doing.what if self._doing is not None and self._doing.running(now_s) else ""
 
     def busy(self, now_s: float) -> bool:
@@ -402,12 +418,38 @@ class SimulatedInstrument:
             InstrumentBusy. InvalidValue: distance or duration is not finite.
         """
         _finite("the way of the stage", *by_m)
-        self.occupy("stage", lasts_s, now_s)
+        self._check_free(now_s)
         if self.engaged:
-            self._add_damage(now_s, "stage", replace(self.ledger, stage_moves=self.ledger.stage_moves + 1))
+            self._strike(now_s)
+        self.occupy("stage", lasts_s, now_s)
         if lasts_s > 0.0:
             self.world.compensate((by_m[0] / lasts_s, by_m[1] / lasts_s), now_s)
             self.world.compensate((0.0, 0.0), now_s + lasts_s)
+
+    def step(self, direction: tuple[int, int, int], steps: int, step_m: float, now_s: float) -> None:
+        """Let the coarse motor go steps, along the sample or, with a positive z, away from it.
+
+        A lateral step lifts the sample on its way, so that a tip that its piezo alone has withdrawn is struck.
+
+        Raises:
+            InstrumentBusy.
+        """
+        self._check_free(now_s)
+        way_m = step_m * steps * (1.0 + _STEP_SPREAD * float(self._noise.normal()) / math.sqrt(max(steps, 1)))
+        x, y, z = direction
+        if z:
+            if self.engaged or self.coarse_m + z * way_m < 0.0:
+                self._strike(now_s)
+            self.coarse_m = max(0.0, self.coarse_m + z * way_m)
+            self.occupy("stage", steps * self.coarse_step_s, now_s)
+            return
+        if not self.engaged and self.coarse_m < _RUN_OUT_M:
+            self._strike(now_s)
+        self.shift_sample((x * way_m, y * way_m), steps * self.coarse_step_s, now_s)
+
+    def _strike(self, now_s: float) -> None:
+        self._add_damage(now_s, "stage", replace(self.ledger, stage_moves=self.ledger.stage_moves + 1))
+        self._crashed(_STRUCK_M, _STRUCK_M_PER_S, now_s, self._probe_m)
 
     def follow(self, velocity_m_per_s: tuple[float, float], now_s: float) -> None:
         """Set the velocity (x, y) at which the scanner follows the sample from now on, also during a scan.
@@ -546,17 +588,34 @@ class SimulatedInstrument:
         return outcome
 
     def engage(self, now_s: float) -> None:
-        """Start the approach to the sample; `engaged` is True from its start."""
+        """Bring the tip to the sample by its piezo; `engaged` is True from the start, if the sample is in reach."""
         self._check_free(now_s)
-        self.engaged = True
+        self.reach()
         self.note_changes(now_s)
         self.occupy("approach", self.setup.approach_s, now_s)
+
+    def reach(self) -> None:
+        """Let the piezo bring the tip to the sample, unless the motor has moved it out of reach."""
+        self.engaged = self.coarse_m <= _REACH_M
+
+    def approach(self, now_s: float) -> None:
+        """Bring the tip to the sample with the coarse motor; `engaged` is True from the end."""
+        self._check_free(now_s)
+        self.occupy("approach", self.setup.approach_s + self.coarse_m / _APPROACH_M_PER_S, now_s)
+        self._lands_s = self._doing.end_s if self._doing is not None and not self.engaged else None
+
+    def approaches(self, now_s: float) -> bool:
+        """Return whether the coarse motor brings the tip to the sample."""
+        return self.doing(now_s) == "approach" and self._lands_s is not None
 
     def withdraw(self, now_s: float) -> None:
         """Stop the activity and withdraw the tip."""
         self.stop_scan(now_s)
         self.stop_spectrum(now_s)
         self.account(now_s)
+        if self.approaches(now_s) and self._lands_s is not None:
+            self.coarse_m = min(self.coarse_m, max(0.0, self._lands_s - now_s) * _APPROACH_M_PER_S)
+        self._lands_s = None
         self._doing, self.engaged, self._held_until_s = None, False, min(self._held_until_s, now_s)
         self.note_changes(now_s)
         self.occupy("approach", self.setup.approach_s, now_s)
@@ -626,6 +685,8 @@ class SimulatedInstrument:
             ledger=self.ledger,
             scanned=self.damage.scanned,
             held_until_s=self._held_until_s if math.isfinite(self._held_until_s) else None,
+            coarse_m=self.coarse_m,
+            lands_s=self._lands_s,
         )
         return {"world": world, "instrument": snapshot(state, "instrument", _STATE_VERSION, lists=True)}
 
@@ -638,6 +699,7 @@ class SimulatedInstrument:
         found = restored(InstrumentState, kept["instrument"], "instrument", _STATE_VERSION)
         self.world.restore(kept["world"])
         self.engaged, self._probe_m = found.engaged, found.probe_m
+        self.coarse_m, self._lands_s = found.coarse_m, found.lands_s
         self._counts = {"scan": found.last_scan, "spectrum": found.spectra}
         self.scan, self.spectrum = found.scan, found.spectrum
         self._held_until_s = -math.inf if found.held_until_s is None else found.held_until_s

@@ -36,7 +36,7 @@ class DamageLedger:
             these indentations.
         saturated_s: time that the preamplifier was saturated in scans and spectra.
         feedback_off_s: time that the tip was engaged with the feedback switched off, without a controller's own hold.
-        stage_moves: moves of the coarse stage while the tip was engaged.
+        stage_moves: moves of the coarse stage while the tip was engaged, or too near for a lateral step.
         until_s: the experiment time up to which the feedback's time is counted.
     """
 

@@ -75,6 +75,7 @@ _NO_TIMEOUT: Final = -1
 _LATE_S: Final = 1.0
 """Time beyond the duration of a pulse or tip shaping, experiment time: a real Nanonis begins up to 0.33 s late, moves
 the tip up to 0.5 s later, and its preamplifier needs up to 0.45 s to leave saturation; it reports no end."""
+_APPROACH_SHOWS_S: Final = 3.0
 _BY_VALUE: Final = (
     geometry.ScanFrame,
     parameter_groups.ScanSpeed,
@@ -489,6 +490,14 @@ class Nanonis(Driver):
         """Switch the z controller on; this also brings back a tip withdrawn by `x-retract` or the safe tip."""
         on = 1
         self._ask("ZCtrl.OnOffSet", on)
+
+    @action(names.APPROACH, state=ScopeState.COARSE_MOTOR)
+    def approach(self) -> None:
+        """Start the *Auto Approach*, as set in its panel; `x-retract` stops it."""
+        on = 1
+        # its status reads off for a moment after the start, as others report
+        with self._activity.occupied(ScopeState.COARSE_MOTOR, _APPROACH_SHOWS_S):
+            self._ask("AutoApproach.OnOffSet", on)
 
     def move_z(self, z_m: float) -> None:
         self._ask("ZCtrl.ZPosSet", z_m)

@@ -44,7 +44,7 @@ SETS: Final[Mapping[str, Mapping[int, str]]] = {
 """The parameters that functions set, by the place of the argument: a number, or a list of numbers."""
 
 _REFUSED: Final[Mapping[str, str]] = {
-    r"AutoApproach\.OnOffSet [^0]": f"it brings the tip to the sample: {_AT_PANEL}",
+    r"AutoApproach\.OnOffSet [^0]": f"it brings the tip to the sample: use {names.APPROACH}, after which it is judged",
     r"ZCtrl\.OnOffSet": _BY_SET.format(names.FEEDBACK_ON, names.FEEDBACK_ON) + ", or use x-engage",
     # it moves away from the sample, but a running approach or scan would bring the tip back
     r"ZCtrl\.Withdraw ": "use x-retract, which first stops what would bring the tip back",
@@ -76,6 +76,7 @@ _REFUSED_ACTIONS: Final[Mapping[str, str]] = {
         "its z offset moves the tip, which no limit bounds: write 0"
     ),
     r"(MProbe)?Bias\.Pulse .* [^2]$": "limits can't judge a relative pulse: write 2, absolute, as the last argument",
+    r"Motor\.StartMove .* 0$": "Nanonis does not show that its motor moves: write 1, wait, as the last argument",
     r"TipShaper\.Start": f"use {names.CRASH}, whose depth limits judge",
     r"Scan\.Action 0": f"use {names.START_SCAN}, which limits judge",
     r"(Bias|Z)Spectr\.Start": f"use {names.START_SPEC}, which limits judge",

@@ -39,7 +39,7 @@ class ArbitrationEvent(Enum):
     END = "ends the experiment"
     COMMAND = "commands the microscope"
     ADJUST = "sets a parameter of [control] adjustable"
-    FEEDBACK_OFF = "says that the feedback is off by intention"
+    FEEDBACK_OFF = "says that the feedback is off by intention, or that the tip is clear"
     READ = "asks the microscope for a value"
     DEAD = "is dead"
     IDLE = "has let its lease run out"
@@ -142,7 +142,8 @@ class RoleTable:
             dashboard, and other components through which a person commands the microscope.
         restart: restart a process.
         approve: approve plans of agents, give grants, revoke both, clear `stopped-by-agent`, and say that the
-            feedback is off by intention (`afspm continue --feedback-off`). No agent has this role. Without the key: the
+            feedback is off by intention (`afspm continue --feedback-off`), or that the tip is clear
+            (`afspm continue --tip-is-clear`). No agent has this role. Without the key: the
             dashboard and other components through which a person commands the microscope, and the terminal of this
             computer.
     """
@@ -454,7 +455,8 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
         _refuse(
             OTHERWISE,
             _R.NOT_IN_CONTROL,
-            "only a person with the role approve says that the feedback is off by intention, in the mode MANUAL",
+            "only a person with the role approve says that the feedback is off by intention, or that the tip is clear,"
+            " in the mode MANUAL",
         ),
     ),
     ArbitrationEvent.READ: (

@@ -92,6 +92,7 @@ def _update_state(draft: StateDraft, published: object) -> None:
             safety_commands.send(draft)
     elif isinstance(published, TipStatus):
         draft.panel = replace(draft.panel, tip=published)
+        draft.limits = draft.limits.tip_shown(published.engaged, draft.now_ns)
         if published.remedy:  # the act itself may have been lost with its translator
             _give_to_person(draft, published.by_hand)
     elif isinstance(published, ActByHand):

@@ -98,7 +98,16 @@ def handle(draft: StateDraft, event: RequestIn) -> None:
     if why:
         answers.answer(draft, event, ControlResponse.PARAM_ERROR, why)
     elif authorise(draft, event):
-        enqueue(draft, event)
+        if event.request.kind == _ACTION and event.request.subject == names.TIP_IS_CLEAR:
+            _take_word(draft, event)
+        else:
+            enqueue(draft, event)
+
+
+def _take_word(draft: StateDraft, event: RequestIn) -> None:
+    draft.limits = draft.limits.tip_is_clear()
+    draft.log("WARNING", f"{event.name} says that the tip is far enough from the sample for lateral moves")
+    answers.answer(draft, event, ControlResponse.SUCCESS)
 
 
 def _by_canonical_name(draft: StateDraft, event: RequestIn) -> tuple[RequestIn, str]:
@@ -243,7 +252,7 @@ def _refusal_to_continue(draft: StateDraft, event: RequestIn) -> str:
 def _microscope_event(request: Request, rules: Rules) -> ArbitrationEvent:
     if reads(request):
         return ArbitrationEvent.READ
-    if request.kind == _ACTION and request.subject == names.FEEDBACK_MAY_BE_OFF:
+    if request.kind == _ACTION and request.subject in (names.FEEDBACK_MAY_BE_OFF, names.TIP_IS_CLEAR):
         return ArbitrationEvent.FEEDBACK_OFF
     is_adjustable = request.kind == _PARAM and request.subject.name in rules.adjustable
     return ArbitrationEvent.ADJUST if is_adjustable else ArbitrationEvent.COMMAND

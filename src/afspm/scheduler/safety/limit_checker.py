@@ -46,10 +46,11 @@ from afspm.model.positions import (
     moved,
 )
 from afspm.model.scan import ShapeChange
-from afspm.scheduler.safety import forbidden_states
+from afspm.scheduler.safety import forbidden_states, movers
 from afspm.scheduler.safety.forbidden_states import PresentState
 from afspm.scheduler.safety.limit_state import LastUse, LimitState, Usage
 from afspm.scheduler.safety.limits import ExperimentLimits, ForbiddenState, Limit
+from afspm.scheduler.safety.movers import MoverState
 from afspm.scheduler.safety.parameter_values import ParameterValue, ParameterValueError, numbers, values_of
 
 _REACH = 1e-9  # relative: a value on the border, to the precision of the arithmetic, is inside
@@ -109,6 +110,7 @@ class LimitChecker:
         """
         try:
             self._check(_Use(who, request.id, now_ns, is_repeated), request, used)
+            self._check_movers(request)
         except _Breach as breach:
             return Response(int(breach.code), b"", breach.reason, request.id, again_ns=breach.again_ns)
         except (ParameterValueError, InvalidValue) as error:
@@ -147,8 +149,7 @@ class LimitChecker:
     def check_forbidden(self, request: Request, present: PresentState) -> Response | None:
         """Return the refusal of a request that leads into a forbidden state; None: it may be sent."""
         why = forbidden_states.refusal(self._with_sweep(request), request, present)
-        code = ControlResponse.ACTION_ERROR if request.kind == ControlRequest.ACTION else ControlResponse.PARAM_ERROR
-        return Response(int(code), b"", why, request.id) if why else None
+        return Response(int(_error_of(request)), b"", why, request.id) if why else None
 
     def _with_sweep(self, request: Request) -> ExperimentLimits:
         # a curve that sweeps the bias sets it to both ends; where they are not shown, the bias in force counts
@@ -197,6 +198,8 @@ class LimitChecker:
             needed += [name for name in of_action if name in limited and limited[name].is_of_a_number]
             if self._is_curve(request):
                 needed += self._ends_to_read()
+            if self.state.movers.is_moved and request.subject in movers.MEASURES:
+                needed += movers.SIGNAL
         if self.limits.region is not None or is_mapped:
             action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
             for place, actions in _PLACES:
@@ -250,7 +253,52 @@ class LimitChecker:
         others = {name: value for name, value in self.state.last_seen.items() if name != names.SPEC_KIND}
         read = replace(self, state=replace(self.state, last_seen=others))
         read = read.seen(value for value in values.values() if value is not None)
+        if names.ENGAGED in values:
+            read = read._with_movers(read.state.movers.shown(values, now_ns, proves=True))
         return read._with_state(usage, self.state.position.was_read(numbers_read))
+
+    def tip_shown(self, engaged: bool | None, now_ns: int) -> LimitChecker:
+        """Store the published state of the tip."""
+        shown = {names.ENGAGED: Parameter(names.ENGAGED, "true" if engaged else "false")}
+        return self if engaged is None else self._with_movers(self.state.movers.shown(shown, now_ns))
+
+    def tip_is_clear(self) -> LimitChecker:
+        """Store a person's word that the tip is far enough from the sample for a lateral move."""
+        return self._with_movers(replace(self.state.movers, is_clear=True))
+
+    def _with_movers(self, state: MoverState) -> LimitChecker:
+        if not self.limits.movers.movers or state == self.state.movers:
+            return self
+        return replace(self, state=replace(self.state, movers=state))
+
+    def _moves(self, request: Request) -> list[tuple[str, float]]:
+        # each mover of a request with its way; the value in force was read for this decision
+        known = self.limits.movers.movers
+        if not known:
+            return []
+        if request.kind == ControlRequest.ACTION:
+            mover = known.get(str(request.subject))
+            return [(str(request.subject), float(mover.steps or 0))] if mover is not None else []
+        found = list[tuple[str, float]]()
+        for name, value in (one for subject in self._set_by(request) for one in self._valid_values(subject)):
+            if name in known and value is not None:
+                before = self.state.usage.known.get(name) or self.state.usage.before.get(name)
+                found.append((name, 0.0 if before is None else abs(value - before.value)))
+        return found
+
+    def _check_movers(self, request: Request) -> None:
+        settings, state = self.limits.movers, self.state.movers
+        for name, way in self._moves(request):
+            if why := state.refusal(settings, name, way):
+                raise _Breach(_error_of(request), why)
+        action = request.subject if request.kind == ControlRequest.ACTION else None
+        if action in movers.MEASURES:
+            why, again_ns = state.refuses_to_measure(settings)
+            if why:
+                raise _Breach(ControlResponse.ACTION_ERROR, f"{action}: {why}", again_ns)
+        if action in names.APPROACHES and state.is_moved and action != settings.approach:
+            why = f"the sample was moved under the tip, which {action} may not reach: approach it ({settings.approach})"
+            raise _Breach(ControlResponse.ACTION_ERROR, why)
 
     def unknown(self, request: Request) -> LimitChecker:
         """Forget the values that a request of unknown outcome may have changed."""
@@ -269,12 +317,16 @@ class LimitChecker:
 
         The time of a change is unknown until the request has settled, so values with a limited rate are set aside.
         """
-        usage = self.state.usage
+        usage, moved = self.state.usage, self.state.movers
+        for name, way in self._moves(request):
+            moved = moved.sent(self.limits.movers, name, way)
+        if request.kind == ControlRequest.ACTION and request.subject in names.APPROACHES:
+            moved = moved.approaching()
         for name in self._counted_uses(request, used):
             usage = usage.use_sent(name, LastUse(now_ns, who, request.id))
         for name in self.limits.rated.intersection(self.names_set_by(request)) if self.limits.rated else ():
             usage = usage.changing(name)
-        return self._with_usage(usage)
+        return self._with_usage(usage)._with_movers(moved)
 
     def counts(self, request: Request) -> bool:
         """Return whether the interval between two requests of this kind is limited."""
@@ -287,7 +339,10 @@ class LimitChecker:
             usage = usage.use_undone(name, who, request.id)
         for name in self.names_set_by(request):
             usage = usage.unchanged(name)
-        return self._with_usage(usage)
+        moved = self.state.movers
+        for name, way in self._moves(request):
+            moved = moved.undone(self.limits.movers, name, way)
+        return self._with_usage(usage)._with_movers(moved)
 
     def carried_out(
         self,
@@ -309,7 +364,12 @@ class LimitChecker:
         usage = self.state.usage
         for name in self._counted_uses(request, used):
             usage = usage.use_done(name, LastUse(now_ns, who, request.id))
-        checker = self._with_usage(usage)
+        moved = self.state.movers
+        for name, way in self._moves(request):
+            moved = moved.done(self.limits.movers, name, way)
+        if request.kind == ControlRequest.ACTION and request.subject == names.RETRACT:
+            moved = replace(moved, retracted=0)  # it may have ended a move of the motor
+        checker = self._with_usage(usage)._with_movers(moved)
         for subject in self._set_by(request):
             # the value in the microscope's answer, rather than the one that was sent
             in_force = (
@@ -596,6 +656,11 @@ def _unseen(kind: str, end: str, limit: Limit) -> str:
 
 def _amount_text(name: str, limit: Limit, amount: float, digits: int = 6) -> str:
     return quantity(amount, limit.unit or BASE_PARAMETERS.get(name) or "", digits)
+
+
+def _error_of(request: Request) -> ControlResponse:
+    is_action = request.kind == ControlRequest.ACTION
+    return ControlResponse.ACTION_ERROR if is_action else ControlResponse.PARAM_ERROR
 
 
 def _action_error(request: Request, breach: _Breach) -> Response:

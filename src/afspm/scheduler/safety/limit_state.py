@@ -9,6 +9,7 @@ from typing import TypeVar
 from afspm.basics.frozen import replace
 from afspm.model import Parameter
 from afspm.model.positions import KnownPosition
+from afspm.scheduler.safety.movers import MoverState
 
 T = TypeVar("T")
 
@@ -121,6 +122,7 @@ class LimitState:
     usage: Usage = field(default_factory=Usage)
     position: KnownPosition = field(default_factory=KnownPosition)
     last_seen: Mapping[str, Parameter] = field(default_factory=dict)
+    movers: MoverState = field(default_factory=MoverState)
 
 
 def _without(uses: Mapping[str, T], name: str) -> dict[str, T]:

@@ -12,6 +12,7 @@ from afspm.basics.units import PositiveDuration
 from afspm.model import Parameter, Region, names
 from afspm.model.bias import BiasReference
 from afspm.scheduler.safety import rule_language
+from afspm.scheduler.safety.movers import MoverSettings
 from afspm.scheduler.safety.rule_language import RuleTree
 
 _KEYS = {"low": "min", "high": "max", "rate_per_s": "rate", "interval_s": "every"}
@@ -175,6 +176,7 @@ class ExperimentLimits:
         roles: further limits by name of a component, or of a person or agent: "agent", "agent:claude".
         forbid: the forbidden states, by name.
         bias: the reference of the bias, which decides the sign of `sample-bias`. No limit here has that name.
+        movers: the stages and coarse motors.
     """
 
     parameters: Mapping[str, Limit] = field(default_factory=dict)
@@ -187,6 +189,7 @@ class ExperimentLimits:
     roles: Mapping[str, RoleLimits] = field(default_factory=dict)
     forbid: Mapping[str, ForbiddenState] = field(default_factory=dict)
     bias: BiasReference = field(default_factory=BiasReference)
+    movers: MoverSettings = field(default_factory=MoverSettings)
 
     @cached_property
     def fixed(self) -> ExperimentLimits:

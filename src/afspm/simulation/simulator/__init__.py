@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Final, Literal, TypeVar
 
 from afspm.basics.errors import AfspmError, ConfigError, ErrorCollector, Refused
-from afspm.basics.plain_data import PlainMapping
-from afspm.basics.units import Duration, PollPeriod
+from afspm.basics.plain_data import Count, PlainMapping
+from afspm.basics.units import Duration, PollPeriod, PositiveLength
 from afspm.model import ChannelRoles, ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.model.variables import VariableRoles
 from afspm.simulation import World
@@ -96,6 +96,14 @@ def _controller_action(
     return act
 
 
+def _coarse_action(name: str, direction: tuple[int, int, int]) -> Callable[[Simulator], None]:
+    @action(name, state=ScopeState.COARSE_MOTOR)
+    def act(self: Simulator) -> None:
+        self._reached(refuses=True).step(direction, self.coarse_steps, self.coarse_step_m, self.clock.now_s())
+
+    return act
+
+
 _BOTH_WAYS: Final = ("Current", "Deflection", "Force", "Frequency Shift")
 _VARIABLES: Final = VariableRoles.declared(
     {
@@ -118,6 +126,8 @@ class Simulator(Driver):
         tip, tip_changes, drift, feedback, noise, signals, iv, force, z, property_map: a table of settings.
         initial: values of parameters at the start, by their generic names.
         approach_s: duration of engaging and retracting.
+        coarse_steps, coarse_step: steps of the coarse motor in one of its actions ("x-coarse-left" …), and the length
+            of one.
         faults: faults and their times, each a table of `kind` (`FAULT_KINDS`), `at_s`, `count`, `duration_s`.
         fault_action: enable the action "x-fault", which triggers faults on demand.
         panel: actions of a person at the controller's panel, each a table of `at_s` with `set` or `action`.
@@ -165,6 +175,8 @@ class Simulator(Driver):
         property_map: Table | None = None,
         initial: Table | None = None,
         approach_s: Duration = 1.0,
+        coarse_steps: Count = 20,
+        coarse_step: PositiveLength = 100e-9,
         faults: list[Table] | None = None,
         fault_action: bool = False,
         panel: list[Table] | None = None,
@@ -201,6 +213,7 @@ class Simulator(Driver):
             Faults(self._faults_settings, FAULT_KINDS, 0.0)
         self._panel = _made(PanelEvent, panel or [], "panel", errors)
         self._fault_action, self._approach_s = fault_action, approach_s
+        self.coarse_steps, self.coarse_step_m = coarse_steps, coarse_step
         self.initial: Mapping[str, Value] = {}
         self.scan_speed_m_s: float | None = None
         self.faults: Faults | None = None
@@ -352,6 +365,8 @@ class Simulator(Driver):
             return self.table[vendor].to_vendor(controller.measured(vendor, self.clock.now_s()))
         if vendor not in self.memory["values"]:
             raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, f"the simulated controller has no {vendor!r}")
+        if vendor == names.ENGAGED:
+            return controller.is_engaged(self.clock.now_s())
         if vendor == FEEDBACK_ON:
             return controller.instrument.feedback_reads(self.clock.now_s())
         value: Value = self.memory["values"][vendor]
@@ -386,6 +401,14 @@ class Simulator(Driver):
     retract = _controller_action(
         names.RETRACT, SimulatedController.retract, state=ScopeState.COARSE_MOTOR, refuses=False
     )
+
+    approach = _controller_action(names.APPROACH, SimulatedController.approach, state=ScopeState.COARSE_MOTOR)
+    coarse_left = _coarse_action("x-coarse-left", (-1, 0, 0))
+    coarse_right = _coarse_action("x-coarse-right", (1, 0, 0))
+    coarse_down = _coarse_action("x-coarse-down", (0, -1, 0))
+    coarse_up = _coarse_action("x-coarse-up", (0, 1, 0))
+    coarse_away = _coarse_action("x-coarse-away", (0, 0, 1))
+    coarse_towards = _coarse_action("x-coarse-towards", (0, 0, -1))
 
     @action(_FAULT, while_busy=True)
     def fault(self) -> None:

@@ -47,6 +47,7 @@ _STATES: Final = {
     "crash": ScopeState.MOVING,
     "pulse": ScopeState.BUSY_PARAM,
     "approach": ScopeState.COARSE_MOTOR,
+    "stage": ScopeState.COARSE_MOTOR,
 }
 NS_PER_S = 1_000_000_000
 
@@ -95,6 +96,7 @@ class SimulatedController:
         self._panel = sorted(panel, key=lambda event: event.at_s)
         kept["values"] = {**self._curves_at_first(kept["values"].get(names.SPEC_KIND, "IV")), **kept["values"]}
         self._put_in_force()
+        instrument.engaged = bool(kept["values"][names.ENGAGED])
         if "instrument" in kept:
             instrument.restore(kept["instrument"])
         else:
@@ -110,6 +112,7 @@ class SimulatedController:
             names.CRASH: self.crash,
             names.RETRACT: self.retract,
             names.ENGAGE: self.engage,
+            names.APPROACH: self.approach,
         }
 
     # --- the running activity ---
@@ -167,7 +170,13 @@ class SimulatedController:
             self._log.error("the simulated measurement failed: %s; it has no file", error)
         self._keep()
 
+    def is_engaged(self, now_s: float) -> bool:
+        """Return whether the tip is at the sample."""
+        self.instrument.doing(now_s)  # an approach may have ended
+        return self.instrument.engaged
+
     def _keep(self) -> None:
+        self._kept["values"][names.ENGAGED] = self.instrument.engaged
         self._kept["instrument"] = self.instrument.state()
 
     # --- values ---
@@ -243,7 +252,6 @@ class SimulatedController:
         setup.bias_v = float(values[names.TIP_BIAS_VOLTAGE])
         setup.slope = (float(values[names.SAMPLE_SLOPE_X]), float(values[names.SAMPLE_SLOPE_Y]))
         setup.move_speed_m_s = float(values[names.MOVE_SPEED])
-        self.instrument.engaged = bool(values[names.ENGAGED])
 
     def _si(self, values: Kept | None = None) -> dict[str, Value]:
         found: dict[str, Value] = self._kept["values"] if values is None else values
@@ -292,16 +300,26 @@ class SimulatedController:
 
     def retract(self, now_s: float) -> None:
         """Stop the activity and withdraw the tip."""
-        self._kept["values"][names.ENGAGED] = False
         self.instrument.withdraw(now_s)
         self._keep()
 
     def engage(self, now_s: float) -> None:
-        """Stop the measurement and approach the sample."""
+        """Stop the measurement and bring the tip to the sample by its piezo."""
         self.stop(now_s)
         with _refusing():
             self.instrument.engage(now_s)
-        self._kept["values"][names.ENGAGED] = True
+        self._keep()
+
+    def approach(self, now_s: float) -> None:
+        """Bring the tip to the sample with the coarse motor."""
+        with _refusing():
+            self.instrument.approach(now_s)
+        self._keep()
+
+    def step(self, direction: tuple[int, int, int], steps: int, step_m: float, now_s: float) -> None:
+        """Let the coarse motor go steps; see `SimulatedInstrument.step`."""
+        with _refusing():
+            self.instrument.step(direction, steps, step_m, now_s)
         self._keep()
 
     def _prepare(self, now_s: float) -> None:

@@ -18,7 +18,6 @@ _Z_AVERAGED: Final = 20
 _STEEPEST_DEG: Final = 45.0
 _TRACKED_S: Final = 60.0
 _STEP_M: Final = 100e-9
-_STEP_S: Final = 1e-3
 
 
 class ZController:
@@ -59,13 +58,13 @@ class ZController:
         rig.switch_feedback(now_s, on=on)
         if z_m:
             rig.hold(z_m + lift_m, now_s)
-        if on:
-            rig.engaged = True
+        if on and not rig.approaches(now_s):
+            rig.reach()
 
     def _status(self, now_s: float) -> int:
         # The protocol's codes: off 1, on 2, hold 3, switching off 4, safe tip 5, withdrawing 6.
         doing = self._core.rig.doing(now_s)
-        if doing == "approach" and not self._core.rig.engaged:
+        if doing == "approach" and not self._core.rig.engaged and not self._core.rig.approaches(now_s):
             return 6
         if self.state == "on" and (doing in ("crash", "shaper") or (doing == "pulse" and self.pulse_holds)):
             return 3
@@ -159,7 +158,7 @@ class ZController:
     @answers("AutoApproach.OnOffSet")
     def _set_approach(self, on: int) -> Answer:
         if on:
-            self._core.rig.engage(self._core.now_s)
+            self._core.rig.approach(self._core.now_s)
             self.switch(self._core.now_s, on=True)
         elif self._approaches():
             self._core.rig.withdraw(self._core.now_s)
@@ -170,7 +169,7 @@ class ZController:
         return (int(self._approaches()),)
 
     def _approaches(self) -> bool:
-        return self._core.rig.engaged and self._core.rig.doing(self._core.now_s) == "approach"
+        return self._core.rig.approaches(self._core.now_s)
 
 
 class TipModules:
@@ -332,7 +331,10 @@ class TipModules:
             raise FunctionRefused(f"{direction} is not a direction")
         now_s = self._core.now_s
         at_m = self._motor_at_m(now_s)
-        self._core.rig.occupy("motor", abs(steps) * _STEP_S, self._core.now_s)
+        way = 1 if direction % 2 == 0 else -1
+        axis = direction // 2
+        along = (way if axis == 0 else 0, way if axis == 1 else 0, way if axis == 2 else 0)
+        self._core.rig.step(along, steps, _STEP_M, now_s)
         self._motor_m, self._motor_walk = at_m, (direction // 2, -steps if direction % 2 else steps, now_s)
         return self._core.until_free(wait)
 
@@ -340,7 +342,7 @@ class TipModules:
     def _stop_motor(self) -> Answer:
         now_s = self._core.now_s
         self._motor_m, self._motor_walk = self._motor_at_m(now_s), (0, 0, now_s)
-        self._core.rig.stop("motor", self._core.now_s)
+        self._core.rig.stop("stage", self._core.now_s)
         return ()
 
     @answers("Motor.PosGet")
@@ -349,7 +351,7 @@ class TipModules:
 
     def _motor_at_m(self, now_s: float) -> tuple[float, float, float]:
         axis, steps, since_s = self._motor_walk
-        walked = math.copysign(min(abs(steps), (now_s - since_s) / _STEP_S), steps)
+        walked = math.copysign(min(abs(steps), (now_s - since_s) / self._core.rig.coarse_step_s), steps)
         at_m = list(self._motor_m)
         at_m[axis] += int(walked) * _STEP_M
         return at_m[0], at_m[1], at_m[2]

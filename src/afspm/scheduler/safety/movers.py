@@ -1,0 +1,175 @@
+"""Movers: stages and coarse motors, which move only under a tip that is far enough from the sample.
+
+| request | needs |
+| --- | --- |
+| any move | a tip that the microscope shows as withdrawn (a rule of `forbid` for each mover) |
+| a lateral move | besides, `retraction` steps away since the tip was last at the sample, or a person's word |
+| a measurement after a move | a tip read at the sample twice, `PROVED_AFTER_S` apart, the current near its setpoint |
+
+A request counts from the moment at which it is sent. With an unknown outcome, a move counts as made, and steps away do
+not. The state is kept over a restart.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+from afspm.basics.formatting import quantity
+from afspm.basics.frozen import replace
+from afspm.model import Parameter, names
+
+Direction = Literal["lateral", "away", "towards"]
+PROVED_AFTER_S: Final = 1.0
+"""Experiment time between the two readings: a step of the motor couples into the current for a moment."""
+MEASURES: Final = frozenset({names.START_SCAN, names.START_SPEC, *names.TREATMENTS, names.HOLD_Z})
+SIGNAL: Final = (names.ENGAGED, names.CURRENT, names.ZCTRL_SETPOINT)
+"""The values of each reading of the tip; a microscope may lack the current."""
+_NEAR: Final = (0.5, 2.0)  # of the setpoint
+
+
+@dataclass(frozen=True)
+class Mover:
+    """A parameter of an instrument, or an action of the microscope, that moves the sample and the tip apart or along.
+
+    Attributes:
+        direction: along the sample ("lateral"), away from it, or towards it.
+        total: the longest way in a run: in steps for an action, and in the unit of a parameter.
+        steps: the steps of one action; None for a parameter.
+        unit: of `total`.
+        source: the place in the experiment file.
+    """
+
+    direction: Direction
+    total: float
+    steps: int | None = None
+    unit: str = ""
+    source: str = "[limits.movers]"
+
+    def way_text(self, way: float) -> str:
+        return f"{way:g} steps" if self.steps is not None else quantity(way, self.unit, 6)
+
+
+@dataclass(frozen=True)
+class MoverSettings:
+    """The movers by the name of their parameter or action.
+
+    Attributes:
+        retraction: the steps away from the sample that a lateral move needs.
+        approach: the action that brings the tip back after a move.
+        source: the place of `retraction` in the experiment file.
+    """
+
+    movers: Mapping[str, Mover] = field(default_factory=dict)
+    retraction: int = 0
+    approach: str = names.ENGAGE
+    source: str = "[limits.movers]"
+
+
+@dataclass(frozen=True)
+class MoverState:
+    """The moves since the tip was last proved at the sample.
+
+    Attributes:
+        ways: the way of each mover in this run, in steps or in its unit.
+        retracted: steps away from the sample since the tip was last at the sample, less the steps towards it.
+        is_clear: whether, by the word of a person since then, the tip is far enough for a lateral move.
+        is_moved: whether something was moved since the tip was last proved at the sample.
+        at_sample_ns: the experiment time of the first of the readings that show the tip at the sample since the move.
+    """
+
+    ways: Mapping[str, float] = field(default_factory=dict)
+    retracted: int = 0
+    is_clear: bool = False
+    is_moved: bool = False
+    at_sample_ns: int | None = None
+
+    def refusal(self, settings: MoverSettings, name: str, way: float) -> str:
+        """Return why a mover may not go this way; empty: it may, if the tip is withdrawn."""
+        mover = settings.movers[name]
+        gone = self.ways.get(name, 0.0)
+        if gone + way > mover.total * (1 + 1e-9):
+            so_far, most = mover.way_text(gone), mover.way_text(mover.total)
+            return f"{name} would go {mover.way_text(way)} after {so_far}, and at most {most} in a run ({mover.source})"
+        if mover.direction == "lateral" and not self.is_clear and self.retracted < settings.retraction:
+            steps = f"{self.retracted} of {settings.retraction} steps away from the sample ({settings.source})"
+            return (
+                f"{name} moves the sample along, and since its last approach the tip has gone {steps}: first retract it"
+                f" with the coarse motor ({_named(settings)}), or let a person say that it is clear:"
+                " afspm continue --tip-is-clear"
+            )
+        return ""
+
+    def sent(self, settings: MoverSettings, name: str, way: float) -> MoverState:
+        mover = settings.movers[name]
+        back = int(way) if mover.direction == "towards" else 0
+        ways = {**self.ways, name: self.ways.get(name, 0.0) + way}
+        return replace(self, ways=ways, retracted=self.retracted - back, is_moved=True, at_sample_ns=None)
+
+    def done(self, settings: MoverSettings, name: str, way: float) -> MoverState:
+        away = int(way) if settings.movers[name].direction == "away" else 0
+        return replace(self, retracted=self.retracted + away) if away else self
+
+    def undone(self, settings: MoverSettings, name: str, way: float) -> MoverState:
+        """Take a request back that was certainly not carried out."""
+        back = int(way) if settings.movers[name].direction == "towards" else 0
+        ways = {**self.ways, name: self.ways.get(name, 0.0) - way}
+        return replace(self, ways=ways, retracted=self.retracted + back)
+
+    def approaching(self) -> MoverState:
+        """Forget how far the tip was: a request that brings it to the sample is sent."""
+        return replace(self, retracted=0, is_clear=False)
+
+    def shown(self, values: Mapping[str, Parameter | None], now_ns: int, *, proves: bool = False) -> MoverState:
+        """Take in a reading of the tip; a second one at the sample ends the moves.
+
+        Args:
+            values: of `SIGNAL`, as read.
+            proves: whether it was read for this decision, and not published some time ago.
+        """
+        if not _is_on(values):
+            return replace(self, at_sample_ns=None)
+        state = self.approaching()
+        if not self.is_moved or not _has_signal(values):
+            return replace(state, at_sample_ns=None)
+        if self.at_sample_ns is None:
+            return replace(state, at_sample_ns=now_ns)
+        if proves and now_ns - self.at_sample_ns >= PROVED_AFTER_S * 1e9:
+            return replace(state, is_moved=False, at_sample_ns=None)
+        return state
+
+    def refuses_to_measure(self, settings: MoverSettings) -> tuple[str, int | None]:
+        """Return why nothing may be measured now, and the time at which it may be tried again; empty: it may."""
+        if not self.is_moved:
+            return "", None
+        moved = "the sample was moved under the tip"
+        if self.at_sample_ns is None:
+            return f"{moved}, and the tip is not shown at the sample since: approach it ({settings.approach})", None
+        again_ns = self.at_sample_ns + math.ceil(PROVED_AFTER_S * 1e9)
+        why = f"{moved}, and the tip is back for less than {PROVED_AFTER_S:g} s: a second reading is awaited"
+        return why, again_ns
+
+
+def _is_on(values: Mapping[str, Parameter | None]) -> bool:
+    shown = values.get(names.ENGAGED)
+    return shown is not None and (shown.value or "").lower() in names.ON_WORDS
+
+
+def _has_signal(values: Mapping[str, Parameter | None]) -> bool:
+    current, setpoint = (_amperes(values.get(name)) for name in (names.CURRENT, names.ZCTRL_SETPOINT))
+    if current is None or not setpoint:
+        return True  # a feedback on another signal, or a microscope that does not show its current
+    return _NEAR[0] <= abs(current / setpoint) <= _NEAR[1]
+
+
+def _amperes(shown: Parameter | None) -> float | None:
+    try:
+        return None if shown is None or shown.unit != "A" else float(shown.value or "")
+    except ValueError:
+        return None
+
+
+def _named(settings: MoverSettings) -> str:
+    return ", ".join(sorted(name for name, one in settings.movers.items() if one.direction == "away")) or "by hand"
