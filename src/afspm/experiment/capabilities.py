@@ -28,6 +28,7 @@ class MicroscopeCapabilities:
         channels: the channels that the microscope may have, by their roles.
         never_withdrawn: actions that need a withdrawn tip, if the microscope never shows the tip.
         bias: the reference of the bias.
+        coarse: actions that move the coarse motor.
         refused_commands: the reasons and remedies why the microscope refuses commands, by the action's name.
     """
 
@@ -39,6 +40,7 @@ class MicroscopeCapabilities:
     max_pixels: int
     bias: BiasReference
     never_withdrawn: tuple[str, ...] = ()
+    coarse: tuple[str, ...] = ()
     refused_commands: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
     def refuses(self, parameter: Parameter) -> str:
@@ -73,9 +75,13 @@ def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None
         return None
     # components beside a shadow are checked as in a run, although none of their requests is sent
     acting = getattr(microscope, "watches", microscope)
-    marks = (getattr(getattr(acting, name), "_afspm_action", None) for name in dir(acting))
+    marks = [
+        mark for name in dir(acting) if (mark := getattr(getattr(acting, name), "_afspm_action", None)) is not None
+    ]
     added = settings.get("actions") or {}
-    actions = {mark.name for mark in marks if mark is not None} | set(added)
+    actions = {mark.name for mark in marks} | set(added)
+    coarse = {mark.name for mark in marks if mark.needs_withdrawn}
+    coarse |= {name for name, what in added.items() if isinstance(what, Mapping) and acting.is_coarse(what)}
     if acting.holds_z():
         actions |= {*names.OF_HELD_Z_ACTIONS}
     try:
@@ -89,7 +95,8 @@ def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None
         return None  # the check of its settings reports the error in the table
     units = {name: table[name].si_unit for name in table}
     most = acting.max_pixels
-    return MicroscopeCapabilities(frozenset(actions), units, sets, table, channels, most, bias, never, refused)
+    of_tip = (never, tuple(sorted(coarse)))
+    return MicroscopeCapabilities(frozenset(actions), units, sets, table, channels, most, bias, *of_tip, refused)
 
 
 def bias_given(settings: Table) -> BiasReference:

@@ -122,6 +122,7 @@ class LimitsReader:
         instruments: parameters of each other instrument, whose units are known only when the instrument runs.
         types: "bool" or "text" for parameters that are no numbers.
         bias: the reference of the bias; limits on `sample-bias` become limits on `tip-bias-voltage`.
+        coarse: actions that move the coarse motor.
     """
 
     document: Document
@@ -133,6 +134,7 @@ class LimitsReader:
     instruments: Mapping[str, Collection[str]] = field(default_factory=dict)
     types: Mapping[str, str] = field(default_factory=dict)
     bias: BiasReference = field(default_factory=BiasReference)
+    coarse: tuple[str, ...] = ()
 
     @property
     def _known_actions(self) -> frozenset[str]:
@@ -382,7 +384,8 @@ class LimitsReader:
             self.document.error(what, *path, hint="leave it out, and move by hand after `afspm pause`")
         approach = names.APPROACH if names.APPROACH in self._known_actions else names.ENGAGE
         source = str(self.document.place(*path, "retraction"))
-        return MoverSettings(given, retraction if _is_count(retraction) else 0, approach, source)
+        undeclared = tuple(one for one in self.coarse if one not in given)
+        return MoverSettings(given, retraction if _is_count(retraction) else 0, approach, undeclared, source)
 
     def _mover(self, name: str, table: object, limits: Mapping[str, Limit]) -> Mover | None:
         path = ("limits", "movers", name)

@@ -136,6 +136,7 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
         actions=None if has is None else has.actions,
         sets={} if has is None else has.sets,
         certain=has is not None,
+        coarse=() if has is None else has.coarse,
         types={}
         if has is None
         else {name: has.table[name].type for name in has.table if not has.table[name].is_number},
@@ -161,6 +162,11 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
         for action, (reason, hint) in () if there is None else there.refused_commands.items():
             what = f"[{translator.name}] actions.{action}: {reason}"
             resolved.document.error(what, translator.name, "actions", action, hint=hint)
+        given = translator.settings.get("actions") or {}
+        for action in (one for one in resolved.limits.movers.undeclared if one in given):
+            what = f"[{translator.name}] actions.{action} moves the coarse motor, and is refused until it is a mover"
+            hint = f'[limits.movers] {action} = {{ direction = "lateral", steps = 10, total = 500 }}'
+            resolved.warning(what, translator.name, "actions", action, hint=hint)
         for action in () if there is None else there.never_withdrawn:
             what = f"[{translator.name}] actions.{action}: it needs a withdrawn tip, which this microscope never shows"
             hint = "leave it out, and do it by hand after `afspm pause`"

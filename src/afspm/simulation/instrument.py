@@ -53,6 +53,7 @@ _PRESSED_M_PER_S = 10e-9  # by a ramp or a feedback, of a tip that meets the sam
 _FASTEST_DRIFT_M_S = 1e-6
 _APPROACH_M_PER_S = 1e-6
 _STEP_SPREAD = 0.3  # of a step of the motor, relative: no two go equally far
+_FALSELY_M = 5e-6
 _REACH_M = 1e-6  # of the z piezo, beyond the height at which the motor has left the tip
 _RUN_OUT_M = 2e-6  # how far a lateral step may lift the sample towards the tip; simulated, without a source
 _STRUCK_M, _STRUCK_M_PER_S = 50e-9, 1e-6  # a tip that the motor drives into the sample
@@ -113,6 +114,7 @@ class InstrumentState:
     held_until_s: float | None = None
     coarse_m: float = 0.0
     lands_s: float | None = None
+    lifts_s: float | None = None
 
 
 class SimulatedInstrument:
@@ -156,6 +158,7 @@ class SimulatedInstrument:
         self.engaged = True
         self.coarse_m = 0.0
         self._lands_s: float | None = None
+        self._lifts_s: float | None = None
         self.scan: ScanActivity | None = None
         self.spectrum: SpectrumActivity | None = None
         self._doing: Doing | None = None
@@ -181,7 +184,10 @@ class SimulatedInstrument:
     def doing(self, now_s: float) -> str:
         """Return the activity: "scan", "spectrum", "move", or the name given to `occupy`; empty if free."""
         if self._lands_s is not None and now_s >= self._lands_s:
+            self.note(self._lands_s, "landed", {"seems": self._lifts_s is not None})
             self._lands_s, self.coarse_m, self.engaged = None, 0.0, True
+        if self._lifts_s is not None and now_s >= self._lifts_s:
+            self._lifts_s, self.coarse_m, self.engaged = None, _FALSELY_M, False
         return self._doing.what if self._doing is not None and self._doing.running(now_s) else ""
 
     def busy(self, now_s: float) -> bool:
@@ -435,6 +441,7 @@ class SimulatedInstrument:
             InstrumentBusy.
         """
         self._check_free(now_s)
+        self.note(now_s, "coarse", {"direction": direction, "steps": steps, "away_m": self.coarse_m})
         way_m = step_m * steps * (1.0 + _STEP_SPREAD * float(self._noise.normal()) / math.sqrt(max(steps, 1)))
         x, y, z = direction
         if z:
@@ -598,11 +605,16 @@ class SimulatedInstrument:
         """Let the piezo bring the tip to the sample, unless the motor has moved it out of reach."""
         self.engaged = self.coarse_m <= _REACH_M
 
-    def approach(self, now_s: float) -> None:
-        """Bring the tip to the sample with the coarse motor; `engaged` is True from the end."""
+    def approach(self, now_s: float, seems_s: float | None = None) -> None:
+        """Bring the tip to the sample with the coarse motor; `engaged` is True from the end.
+
+        Args:
+            seems_s: how long the tip seems to be at the sample, though it is not; None: it is.
+        """
         self._check_free(now_s)
         self.occupy("approach", self.setup.approach_s + self.coarse_m / _APPROACH_M_PER_S, now_s)
         self._lands_s = self._doing.end_s if self._doing is not None and not self.engaged else None
+        self._lifts_s = None if seems_s is None or self._lands_s is None else self._lands_s + seems_s
 
     def approaches(self, now_s: float) -> bool:
         """Return whether the coarse motor brings the tip to the sample."""
@@ -615,7 +627,7 @@ class SimulatedInstrument:
         self.account(now_s)
         if self.approaches(now_s) and self._lands_s is not None:
             self.coarse_m = min(self.coarse_m, max(0.0, self._lands_s - now_s) * _APPROACH_M_PER_S)
-        self._lands_s = None
+        self._lands_s = self._lifts_s = None
         self._doing, self.engaged, self._held_until_s = None, False, min(self._held_until_s, now_s)
         self.note_changes(now_s)
         self.occupy("approach", self.setup.approach_s, now_s)
@@ -687,6 +699,7 @@ class SimulatedInstrument:
             held_until_s=self._held_until_s if math.isfinite(self._held_until_s) else None,
             coarse_m=self.coarse_m,
             lands_s=self._lands_s,
+            lifts_s=self._lifts_s,
         )
         return {"world": world, "instrument": snapshot(state, "instrument", _STATE_VERSION, lists=True)}
 
@@ -699,7 +712,7 @@ class SimulatedInstrument:
         found = restored(InstrumentState, kept["instrument"], "instrument", _STATE_VERSION)
         self.world.restore(kept["world"])
         self.engaged, self._probe_m = found.engaged, found.probe_m
-        self.coarse_m, self._lands_s = found.coarse_m, found.lands_s
+        self.coarse_m, self._lands_s, self._lifts_s = found.coarse_m, found.lands_s, found.lifts_s
         self._counts = {"scan": found.last_scan, "spectrum": found.spectra}
         self.scan, self.spectrum = found.scan, found.spectrum
         self._held_until_s = -math.inf if found.held_until_s is None else found.held_until_s

@@ -116,7 +116,12 @@ Method = TypeVar("Method", bound=Callable[[Any], None])
 
 
 def action(
-    name: str, *, state: ScopeState | None = None, while_busy: bool | None = None, switches_feedback: bool = False
+    name: str,
+    *,
+    state: ScopeState | None = None,
+    while_busy: bool | None = None,
+    switches_feedback: bool = False,
+    is_coarse: bool = False,
 ) -> Callable[[Method], Method]:
     """Mark a method of a `Driver` as the generic action `name`.
 
@@ -127,6 +132,8 @@ def action(
             of this name, or False for other actions.
         switches_feedback: True if the action may switch the z feedback by itself, and leave it so: its state
             after it counts as wished. Otherwise a feedback found off is a person's doing.
+        is_coarse: True if the action moves the coarse motor: it needs a withdrawn tip, and a mover in the experiment
+            file.
     """
     known = _KNOWN.get(name, Action(name, _not_implemented))
     mark = replace(
@@ -134,6 +141,7 @@ def action(
         state=known.state if state is None else state,
         while_busy=known.while_busy if while_busy is None else while_busy,
         switches_feedback=switches_feedback,
+        needs_withdrawn=is_coarse,
     )
 
     def marked(method: Method) -> Method:
@@ -416,9 +424,14 @@ class DriverBase(ABC):
     @classmethod
     def needs_withdrawn(cls, action: Mapping[str, object]) -> bool:
         """Return whether an action of the experiment file needs a withdrawn tip."""
+        return bool(action.get("withdrawn", cls.is_coarse(action)))
+
+    @classmethod
+    def is_coarse(cls, action: Mapping[str, object]) -> bool:
+        """Return whether an action of the experiment file is known to move the coarse motor or stage."""
         command = str(action.get("command", ""))
-        is_coarse = bool(cls.coarse_commands and re.search(cls.coarse_commands, command))
-        return bool(action.get("withdrawn", is_coarse))  # `false` is a person's word for a command that is safe
+        is_known = bool(cls.coarse_commands and re.search(cls.coarse_commands, command))
+        return is_known and action.get("withdrawn") is not False  # a person's word for a command that is safe
 
     @classmethod
     def never_withdrawn(cls, settings: PlainMapping) -> tuple[str, ...]:

@@ -292,6 +292,9 @@ class LimitChecker:
             if why := state.refusal(settings, name, way):
                 raise _Breach(_error_of(request), why)
         action = request.subject if request.kind == ControlRequest.ACTION else None
+        if action in settings.undeclared:
+            why = f"{action} moves the coarse motor: declare it in the experiment file ([limits.movers.{action}])"
+            raise _Breach(ControlResponse.ACTION_ERROR, why)
         if action in movers.MEASURES:
             why, again_ns = state.refuses_to_measure(settings)
             if why:
@@ -319,7 +322,7 @@ class LimitChecker:
         """
         usage, moved = self.state.usage, self.state.movers
         for name, way in self._moves(request):
-            moved = moved.sent(self.limits.movers, name, way)
+            moved = moved.sent(name, way)
         if request.kind == ControlRequest.ACTION and request.subject in names.APPROACHES:
             moved = moved.approaching()
         for name in self._counted_uses(request, used):
@@ -341,7 +344,7 @@ class LimitChecker:
             usage = usage.unchanged(name)
         moved = self.state.movers
         for name, way in self._moves(request):
-            moved = moved.undone(self.limits.movers, name, way)
+            moved = moved.undone(name, way)
         return self._with_usage(usage)._with_movers(moved)
 
     def carried_out(

@@ -21,7 +21,7 @@ from afspm.basics.formatting import quantity
 from afspm.basics.frozen import replace
 from afspm.model import Parameter, names
 
-Direction = Literal["lateral", "away", "towards"]
+Direction = Literal["lateral", "away"]
 PROVED_AFTER_S: Final = 1.0
 """Experiment time between the two readings: a step of the motor couples into the current for a moment."""
 MEASURES: Final = frozenset({names.START_SCAN, names.START_SPEC, *names.TREATMENTS, names.HOLD_Z})
@@ -35,7 +35,7 @@ class Mover:
     """A parameter of an instrument, or an action of the microscope, that moves the sample and the tip apart or along.
 
     Attributes:
-        direction: along the sample ("lateral"), away from it, or towards it.
+        direction: along the sample ("lateral"), or away from it; towards it, an approach alone brings the tip.
         total: the longest way in a run: in steps for an action, and in the unit of a parameter.
         steps: the steps of one action; None for a parameter.
         unit: of `total`.
@@ -59,12 +59,14 @@ class MoverSettings:
     Attributes:
         retraction: the steps away from the sample that a lateral move needs.
         approach: the action that brings the tip back after a move.
+        undeclared: actions of the microscope that move its coarse motor, and are no movers.
         source: the place of `retraction` in the experiment file.
     """
 
     movers: Mapping[str, Mover] = field(default_factory=dict)
     retraction: int = 0
     approach: str = names.ENGAGE
+    undeclared: tuple[str, ...] = ()
     source: str = "[limits.movers]"
 
 
@@ -74,7 +76,7 @@ class MoverState:
 
     Attributes:
         ways: the way of each mover in this run, in steps or in its unit.
-        retracted: steps away from the sample since the tip was last at the sample, less the steps towards it.
+        retracted: steps away from the sample since the tip was last at the sample.
         is_clear: whether, by the word of a person since then, the tip is far enough for a lateral move.
         is_moved: whether something was moved since the tip was last proved at the sample.
         at_sample_ns: the experiment time of the first of the readings that show the tip at the sample since the move.
@@ -102,21 +104,19 @@ class MoverState:
             )
         return ""
 
-    def sent(self, settings: MoverSettings, name: str, way: float) -> MoverState:
-        mover = settings.movers[name]
-        back = int(way) if mover.direction == "towards" else 0
-        ways = {**self.ways, name: self.ways.get(name, 0.0) + way}
-        return replace(self, ways=ways, retracted=self.retracted - back, is_moved=True, at_sample_ns=None)
+    def sent(self, name: str, way: float) -> MoverState:
+        return replace(self._with_way(name, way), is_moved=True, at_sample_ns=None)
 
     def done(self, settings: MoverSettings, name: str, way: float) -> MoverState:
         away = int(way) if settings.movers[name].direction == "away" else 0
         return replace(self, retracted=self.retracted + away) if away else self
 
-    def undone(self, settings: MoverSettings, name: str, way: float) -> MoverState:
-        """Take a request back that was certainly not carried out."""
-        back = int(way) if settings.movers[name].direction == "towards" else 0
-        ways = {**self.ways, name: self.ways.get(name, 0.0) - way}
-        return replace(self, ways=ways, retracted=self.retracted + back)
+    def undone(self, name: str, way: float) -> MoverState:
+        """Take back a request that was certainly not carried out. An approach is still needed."""
+        return self._with_way(name, -way)
+
+    def _with_way(self, name: str, way: float) -> MoverState:
+        return replace(self, ways={**self.ways, name: self.ways.get(name, 0.0) + way})
 
     def approaching(self) -> MoverState:
         """Forget how far the tip was: a request that brings it to the sample is sent."""

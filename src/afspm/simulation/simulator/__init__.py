@@ -43,6 +43,7 @@ Rows = dict[str, Table]
 
 FAULT_KINDS: Final[Mapping[str, str]] = {
     **INSTRUMENT_FAULTS,
+    "false-landing": "an approach ends too far away, and the tip seems to be at the sample for the duration",
     "late-reply": "an answer is delayed by the duration (real time)",
     "no-reply": "a request is carried out but not answered",
     "error": "the controller refuses a request",
@@ -97,7 +98,7 @@ def _controller_action(
 
 
 def _coarse_action(name: str, direction: tuple[int, int, int]) -> Callable[[Simulator], None]:
-    @action(name, state=ScopeState.COARSE_MOTOR)
+    @action(name, state=ScopeState.COARSE_MOTOR, is_coarse=True)
     def act(self: Simulator) -> None:
         self._reached(refuses=True).step(direction, self.coarse_steps, self.coarse_step_m, self.clock.now_s())
 
@@ -408,7 +409,6 @@ class Simulator(Driver):
     coarse_down = _coarse_action("x-coarse-down", (0, -1, 0))
     coarse_up = _coarse_action("x-coarse-up", (0, 1, 0))
     coarse_away = _coarse_action("x-coarse-away", (0, 0, 1))
-    coarse_towards = _coarse_action("x-coarse-towards", (0, 0, -1))
 
     @action(_FAULT, while_busy=True)
     def fault(self) -> None:

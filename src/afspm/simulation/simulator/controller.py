@@ -312,8 +312,9 @@ class SimulatedController:
 
     def approach(self, now_s: float) -> None:
         """Bring the tip to the sample with the coarse motor."""
+        false = self._faults.strikes("false-landing", now_s)
         with _refusing():
-            self.instrument.approach(now_s)
+            self.instrument.approach(now_s, seems_s=None if false is None else false.duration_s)
         self._keep()
 
     def step(self, direction: tuple[int, int, int], steps: int, step_m: float, now_s: float) -> None:
