@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 from afspm import Component, Region
 from afspm.basics.errors import ControlLost, NoResponse, Refused
-from afspm.model import ControlMode, names
+from afspm.model import ControlMode, Problem, names
 from afspm.scheduler import ExperimentLimits
 from afspm.scheduler.safety.limits import ForbiddenState
 from afspm.scheduler.safety.movers import PROVED_AFTER_S, Mover, MoverSettings
@@ -154,6 +154,7 @@ def night(seed: int, folder: Path, mutant: Mutant = "") -> MoverNight:
         bench.at(draw.uniform(1.0, LASTS_S), bench.kill, draw.choice(("", "sites", "scheduler", "translator")))
     for at_s in range(45, int(LASTS_S), 40):
         bench.at(at_s, bench.set_mode, ControlMode.AUTOMATED)
+        bench.at(at_s + 1, bench.clear, Problem.DEVICE_MALFUNCTION)
     try:
         bench.run(until=LASTS_S)
     finally:

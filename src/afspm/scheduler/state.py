@@ -109,6 +109,7 @@ class SchedulerState:
             self.grants.book,
             self.panel,
             self.limits.state.usage,
+            self.limits.state.movers,
             self.idempotency.sent_actions,
             self.event_log.starts,
             self.instruments.units,

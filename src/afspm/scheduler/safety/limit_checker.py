@@ -198,7 +198,7 @@ class LimitChecker:
             needed += [name for name in of_action if name in limited and limited[name].is_of_a_number]
             if self._is_curve(request):
                 needed += self._ends_to_read()
-            if self.state.movers.is_moved and request.subject in movers.MEASURES:
+            if self.state.movers.is_unproved and request.subject in movers.MEASURES:
                 needed += movers.SIGNAL
         if self.limits.region is not None or is_mapped:
             action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
@@ -299,7 +299,7 @@ class LimitChecker:
             why, again_ns = state.refuses_to_measure(settings)
             if why:
                 raise _Breach(ControlResponse.ACTION_ERROR, f"{action}: {why}", again_ns)
-        if action in names.APPROACHES and state.is_moved and action != settings.approach:
+        if action in names.APPROACHES and state.is_unproved and action != settings.approach:
             why = f"the sample was moved under the tip, which {action} may not reach: approach it ({settings.approach})"
             raise _Breach(ControlResponse.ACTION_ERROR, why)
 
@@ -324,7 +324,7 @@ class LimitChecker:
         for name, way in self._moves(request):
             moved = moved.sent(name, way)
         if request.kind == ControlRequest.ACTION and request.subject in names.APPROACHES:
-            moved = moved.approaching()
+            moved = moved.approaching(self.limits.movers, str(request.subject))
         for name in self._counted_uses(request, used):
             usage = usage.use_sent(name, LastUse(now_ns, who, request.id))
         for name in self.limits.rated.intersection(self.names_set_by(request)) if self.limits.rated else ():

@@ -78,14 +78,14 @@ class MoverState:
         ways: the way of each mover in this run, in steps or in its unit.
         retracted: steps away from the sample since the tip was last at the sample.
         is_clear: whether, by the word of a person since then, the tip is far enough for a lateral move.
-        is_moved: whether something was moved since the tip was last proved at the sample.
+        is_unproved: whether something was moved, or the motor approached, since the tip was proved at the sample.
         at_sample_ns: the experiment time of the first of the readings that show the tip at the sample since the move.
     """
 
     ways: Mapping[str, float] = field(default_factory=dict)
     retracted: int = 0
     is_clear: bool = False
-    is_moved: bool = False
+    is_unproved: bool = False
     at_sample_ns: int | None = None
 
     def refusal(self, settings: MoverSettings, name: str, way: float) -> str:
@@ -105,7 +105,7 @@ class MoverState:
         return ""
 
     def sent(self, name: str, way: float) -> MoverState:
-        return replace(self._with_way(name, way), is_moved=True, at_sample_ns=None)
+        return replace(self._with_way(name, way), is_unproved=True, at_sample_ns=None)
 
     def done(self, settings: MoverSettings, name: str, way: float) -> MoverState:
         away = int(way) if settings.movers[name].direction == "away" else 0
@@ -118,8 +118,11 @@ class MoverState:
     def _with_way(self, name: str, way: float) -> MoverState:
         return replace(self, ways={**self.ways, name: self.ways.get(name, 0.0) + way})
 
-    def approaching(self) -> MoverState:
-        """Forget how far the tip was: a request that brings it to the sample is sent."""
+    def approaching(self, settings: MoverSettings, action: str) -> MoverState:
+        """Forget how far the tip was: an action that brings it to the sample is sent."""
+        return replace(self._near(), is_unproved=self.is_unproved or action == settings.approach, at_sample_ns=None)
+
+    def _near(self) -> MoverState:
         return replace(self, retracted=0, is_clear=False)
 
     def shown(self, values: Mapping[str, Parameter | None], now_ns: int, *, proves: bool = False) -> MoverState:
@@ -131,25 +134,24 @@ class MoverState:
         """
         if not _is_on(values):
             return replace(self, at_sample_ns=None)
-        state = self.approaching()
-        if not self.is_moved or not _has_signal(values):
+        state = self._near()
+        if not self.is_unproved or not _has_signal(values):
             return replace(state, at_sample_ns=None)
         if self.at_sample_ns is None:
             return replace(state, at_sample_ns=now_ns)
         if proves and now_ns - self.at_sample_ns >= PROVED_AFTER_S * 1e9:
-            return replace(state, is_moved=False, at_sample_ns=None)
+            return replace(state, is_unproved=False, at_sample_ns=None)
         return state
 
     def refuses_to_measure(self, settings: MoverSettings) -> tuple[str, int | None]:
         """Return why nothing may be measured now, and the time at which it may be tried again; empty: it may."""
-        if not self.is_moved:
+        if not self.is_unproved:
             return "", None
-        moved = "the sample was moved under the tip"
+        moved = "the coarse motor or a stage has moved"
         if self.at_sample_ns is None:
-            return f"{moved}, and the tip is not shown at the sample since: approach it ({settings.approach})", None
+            return f"{moved}, and the tip does not read at the sample since: approach it ({settings.approach})", None
         again_ns = self.at_sample_ns + math.ceil(PROVED_AFTER_S * 1e9)
-        why = f"{moved}, and the tip is back for less than {PROVED_AFTER_S:g} s: a second reading is awaited"
-        return why, again_ns
+        return f"{moved}, and the tip is back for less than {PROVED_AFTER_S:g} s: a second reading is awaited", again_ns
 
 
 def _is_on(values: Mapping[str, Parameter | None]) -> bool:

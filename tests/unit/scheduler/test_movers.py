@@ -1,0 +1,234 @@
+"""Stages and coarse motors: what moves, when, and what may be measured afterwards; through the whole scheduler."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from tests.unit.scheduler.logic_lab import Lab, in_control, killed, replies
+
+from afspm.model import (
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    Parameter,
+    Response,
+    ResponseDetail,
+    ScopeState,
+    TipStatus,
+    names,
+)
+from afspm.scheduler.control.arbitration import RoleTable, Rules
+from afspm.scheduler.safety.limit_checker import LimitChecker
+from afspm.scheduler.safety.limits import ExperimentLimits, ForbiddenState, Limit
+from afspm.scheduler.safety.movers import Mover, MoverSettings, MoverState
+from afspm.scheduler.settings import SchedulerSettings
+
+ACTION = ControlRequest.ACTION
+AWAY, RIGHT, STAGE = "COARSE_OUT", "COARSE_RIGHT", "lab.stage-x"
+MOVERS = {
+    AWAY: Mover("away", 1000, 20),
+    RIGHT: Mover("lateral", 30, 10),
+    STAGE: Mover("lateral", 5.0, unit="mm"),
+}
+LIMITS = ExperimentLimits(
+    {STAGE: Limit(step=2.0, unit="mm")},
+    forbid={f"changes({one}) and x-engaged": ForbiddenState(f"changes({one}) and x-engaged") for one in (AWAY, RIGHT)},
+    movers=MoverSettings(MOVERS, 40, names.APPROACH, undeclared=("COARSE_UP",)),
+)
+SETTINGS = SchedulerSettings(limits=LIMITS, rules=Rules(RoleTable(approve=("page",))))
+
+
+class Motor:
+    """A scheduler with a microscope whose tip and current read as given."""
+
+    def __init__(self) -> None:
+        self.lab: Lab = in_control(SETTINGS)
+        self.tip: dict[str, Any] = {"x_engaged": "true"}
+        self.lab.answer_reads(**self.tip)
+        self.lab.scope_is(ScopeState.FREE)
+        self.number = 0
+
+    def refusal(self, action: str) -> Response:
+        """Ask for an action, and return its refusal; it is refused for certain."""
+        found = self._asked(action)
+        assert found is not None, f"{action} was sent"
+        return found
+
+    def does(self, action: str, code: ControlResponse = ControlResponse.SUCCESS) -> None:
+        """Ask for an action, which is sent, and let the translator answer it."""
+        found = self._asked(action)
+        assert found is None, found
+        detail = ResponseDetail.OUTCOME_UNKNOWN if code == ControlResponse.NO_RESPONSE else ResponseDetail.NONE
+        flight = self.lab.in_flight()
+        assert flight is not None
+        self.lab.answer(flight, code, detail=detail)
+        self.lab.scope_is(ScopeState.FREE)
+
+    def _asked(self, action: str) -> Response | None:
+        self.number += 1
+        asked = f"experiment/1/{self.number}"
+        effects = self.lab.ask("experiment", ACTION, action, asked)
+        effects = effects + self.lab.answer_reads(**self.tip)
+        return next((one.response for one in replies(effects) if one.response.id == asked), None)
+
+    def withdraws(self) -> None:
+        self.does(names.RETRACT)
+        self.tip = {"x_engaged": "false"}
+
+    def lands(self) -> None:
+        self.does(names.APPROACH)
+        self.tip = {"x_engaged": "true"}
+
+    def goes_right(self) -> None:
+        self.withdraws()
+        self.does(AWAY)
+        self.does(AWAY)
+        self.does(RIGHT)
+
+    @property
+    def state(self) -> MoverState:
+        limits: LimitChecker = self.lab.core.state.limits
+        return limits.state.movers
+
+
+@pytest.fixture
+def motor() -> Motor:
+    return Motor()
+
+
+def test_motor_moves_only_a_tip_that_reads_as_withdrawn(motor: Motor) -> None:
+    assert "first withdraw the tip" in motor.refusal(AWAY).reason
+    motor.tip = {}
+    assert "a value is unknown: x-engaged" in motor.refusal(AWAY).reason
+    motor.tip = {"x_engaged": "false"}
+    motor.does(AWAY)
+
+
+def test_lateral_move_needs_its_steps_away(motor: Motor) -> None:
+    motor.withdraws()
+    why = motor.refusal(RIGHT).reason
+    assert "0 of 40 steps away from the sample" in why
+    assert "afspm continue --tip-is-clear" in why
+    motor.does(AWAY)
+    assert "20 of 40" in motor.refusal(RIGHT).reason
+    motor.does(AWAY)
+    motor.does(RIGHT)
+
+
+@pytest.mark.parametrize("code", [ControlResponse.NO_RESPONSE, ControlResponse.ACTION_ERROR])
+def test_steps_away_count_only_when_they_were_made(motor: Motor, code: ControlResponse) -> None:
+    motor.withdraws()
+    motor.does(AWAY)
+    motor.does(AWAY, code)
+    assert "20 of 40" in motor.refusal(RIGHT).reason
+
+
+@pytest.mark.parametrize("action", [names.ENGAGE, names.APPROACH, names.RETRACT])
+def test_steps_away_are_forgotten_when_the_tip_moves_otherwise(motor: Motor, action: str) -> None:
+    motor.withdraws()
+    motor.does(AWAY)
+    motor.does(AWAY)
+    if action == names.ENGAGE:
+        assert "x-engage may not reach: approach it (x-approach)" in motor.refusal(action).reason
+        return
+    motor.does(action)
+    assert "0 of 40" in motor.refusal(RIGHT).reason
+
+
+def test_steps_away_are_forgotten_when_a_person_brings_the_tip_back(motor: Motor) -> None:
+    motor.withdraws()
+    motor.does(AWAY)
+    motor.does(AWAY)
+    motor.lab.publish("TipStatus", TipStatus(engaged=True))
+    motor.lab.publish("TipStatus", TipStatus(engaged=False))
+    assert "0 of 40" in motor.refusal(RIGHT).reason
+
+
+def test_moves_end_with_their_total(motor: Motor) -> None:
+    motor.goes_right()
+    motor.does(RIGHT)
+    motor.does(RIGHT, ControlResponse.ACTION_ERROR)  # it does not count
+    motor.does(RIGHT, ControlResponse.NO_RESPONSE)  # it counts
+    assert "would go 10 steps after 30 steps, and at most 30 steps in a run" in motor.refusal(RIGHT).reason
+
+
+def test_undeclared_motor_is_refused(motor: Motor) -> None:
+    motor.withdraws()
+    assert "declare it in the experiment file ([limits.movers.COARSE_UP])" in motor.refusal("COARSE_UP").reason
+
+
+@pytest.mark.parametrize("code", [ControlResponse.SUCCESS, ControlResponse.NO_RESPONSE])
+def test_nothing_is_measured_after_a_move_before_the_tip_was_read_twice(motor: Motor, code: ControlResponse) -> None:
+    motor.withdraws()
+    motor.does(AWAY, code)
+    assert "the tip does not read at the sample since: approach it" in motor.refusal(names.START_SCAN).reason
+    motor.lands()
+    first = motor.refusal(names.START_SCAN)
+    assert "a second reading is awaited" in first.reason
+    assert first.again_ns == motor.lab.now_ns + 10**9
+    motor.lab.later(experiment_s=0.5)
+    assert motor.refusal(names.PULSE).again_ns == first.again_ns
+    motor.lab.later(experiment_s=0.5)
+    motor.does(names.START_SCAN)
+
+
+def test_landing_that_is_lost_within_a_second_is_none(motor: Motor) -> None:
+    motor.goes_right()
+    motor.lands()
+    assert motor.refusal(names.START_SPEC).again_ns is not None
+    motor.tip = {"x_engaged": "false"}
+    motor.lab.later(experiment_s=1.0)
+    assert motor.refusal(names.START_SPEC).again_ns is None
+    motor.tip = {"x_engaged": "true"}
+    motor.lab.later(experiment_s=1.0)
+    assert motor.refusal(names.START_SPEC).again_ns == motor.lab.now_ns + 10**9, "from the beginning"
+
+
+def test_current_far_from_the_setpoint_is_no_landing(motor: Motor) -> None:
+    read = {"x-engaged": Parameter("x-engaged", "true"), "zctrl-setpoint": Parameter("zctrl-setpoint", "1e-10", "A")}
+    for amperes, is_there in (("9e-11", True), ("-9e-11", True), ("1e-12", False), ("3e-10", False), ("nan", False)):
+        values = {**read, "x-current": Parameter("x-current", amperes, "A")}
+        shown = MoverState(is_unproved=True).shown(values, 1)
+        assert (shown.at_sample_ns is not None) is is_there, amperes
+
+
+def test_state_survives_a_kill(motor: Motor) -> None:
+    motor.goes_right()
+    before = motor.state
+    assert before.is_unproved
+    assert before.retracted == 40
+    assert killed(motor.lab, SETTINGS).core.state.limits.state.movers == before
+
+
+def test_word_of_a_person_stands_for_the_steps_until_the_next_approach(motor: Motor) -> None:
+    motor.withdraws()
+    assert motor.lab.says("experiment", ACTION, names.TIP_IS_CLEAR) == ControlResponse.NOT_IN_CONTROL
+    motor.lab.mode("page", ControlMode.MANUAL)
+    assert motor.lab.says("experiment", ACTION, names.TIP_IS_CLEAR) == ControlResponse.NOT_IN_CONTROL
+    assert motor.lab.says("page", ACTION, names.TIP_IS_CLEAR) == ControlResponse.SUCCESS
+    motor.lab.mode("page", ControlMode.AUTOMATED)
+    motor.lab.take_control("experiment")
+    motor.does(RIGHT)
+    motor.lands()
+    motor.withdraws()
+    assert "0 of 40" in motor.refusal(RIGHT).reason
+
+
+def test_stage_of_another_instrument_counts_its_way() -> None:
+    settings = LIMITS.movers
+    state = MoverState(retracted=40).sent(STAGE, 2.0).sent(STAGE, 2.0)
+    assert state.refusal(settings, STAGE, 1.0) == ""
+    assert "would go 1.5 mm after 4 mm, and at most 5 mm in a run" in state.refusal(settings, STAGE, 1.5)
+
+
+def test_approach_by_the_motor_is_proved_even_without_a_move(motor: Motor) -> None:
+    motor.withdraws()
+    motor.lands()
+    assert motor.refusal(names.START_SCAN).again_ns is not None
+    motor.lab.later(experiment_s=1.0)
+    motor.does(names.START_SCAN)
+    motor.withdraws()
+    motor.does(names.ENGAGE)  # by the piezo
+    motor.tip = {"x_engaged": "true"}
+    motor.does(names.START_SCAN)
