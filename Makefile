@@ -269,12 +269,15 @@ REPORTS ?=
 as-reported: $(TEST)
 	@$(BIN)/python -m tests.plugins.nanonis.as_reported $(REPORTS)
 
-## a long deterministic simulation, and held z with kills at any step: make simulate HOURS=100000 SEED=1 HOLDS=200
+## a long deterministic simulation, held z with kills at any step, and nights with a coarse motor:
+## make simulate HOURS=100000 SEED=1 HOLDS=200 MOVES=200
 HOURS ?= 20000
 SEED ?= 1
 HOLDS ?= 200
+MOVES ?= 200
 simulate: $(TEST)
 	@$(BIN)/python -m tests.simulation.held_z_kills $(HOLDS)
+	@$(BIN)/python -m tests.simulation.mover_nights $(MOVES)
 	@$(BIN)/python -m tests.simulation.long_run --hours $(HOURS) --seed $(SEED)
 
 ## nights with kills, replayed by what-if without a change: NIGHTS=200 SEED=0

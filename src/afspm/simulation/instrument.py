@@ -445,9 +445,10 @@ class SimulatedInstrument:
         way_m = step_m * steps * (1.0 + _STEP_SPREAD * float(self._noise.normal()) / math.sqrt(max(steps, 1)))
         x, y, z = direction
         if z:
-            if self.engaged or self.coarse_m + z * way_m < 0.0:
+            if self.coarse_m + z * way_m < 0.0:
                 self._strike(now_s)
             self.coarse_m = max(0.0, self.coarse_m + z * way_m)
+            self.engaged = self.engaged and self.coarse_m <= _REACH_M  # the feedback follows as far as it reaches
             self.occupy("stage", steps * self.coarse_step_s, now_s)
             return
         if not self.engaged and self.coarse_m < _RUN_OUT_M:

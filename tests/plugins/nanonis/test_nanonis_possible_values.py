@@ -227,7 +227,7 @@ def test_dip_is_refused_if_other_values_are_in_force(bench: Make, monkeypatch: p
 
 def test_step_of_the_coarse_motor_needs_a_withdrawn_tip(bench: Make) -> None:
     # results 30: an action with Motor.StartMove had no guard
-    step = {"command": "Motor.StartMove 4 10 0 0"}
+    step = {"command": "Motor.StartMove 4 10 0 1"}
     made, peer = lenient(bench, actions={"x-step": step})
     response = peer.act("x-step")
     assert response.code == ControlResponse.ACTION_ERROR

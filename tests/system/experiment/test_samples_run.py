@@ -31,6 +31,7 @@ QUICKER: dict[str, tuple[str, int, int]] = {
     "agent": ("", 1, 1),
     "region_grid": ("[grid]\ncounts = [2, 2]\npixels = [16, 16]\n", 4, 0),
     "adaptive_map": ("[map.until]\nspectra = 12\n", 0, 12),
+    "other_sites": ("[sites]\nsites = 2\n", 2, 0),
     "three_spots": ("".join(f"[spot_{one}]\ncounts = [2, 2]\n" for one in "abc"), 0, 12),
     "spectroscopy_grid": ("[curves]\ncounts = [2, 2]\n", 0, 4),
     "line_watch": ("[series]\nscans = 2\npixels = [16, 16]\n", 2, 0),

@@ -115,7 +115,7 @@ def test_each_limit_has_a_default_that_a_file_may_tighten() -> None:
     of_experiment = bounds(ExperimentLimits)
     assert LimitsSection.model_fields.keys() == {*map(limit_key, of_experiment), "loosen"}
     places, merged_by_name = (f"{name}_source" for name in of_experiment), ("parameters", "actions", "forbid")
-    of_file_alone = ("sets", "roles", "bias")
+    of_file_alone = ("sets", "roles", "bias", "movers")
     assert {one.name for one in fields(ExperimentLimits)} == {
         *of_experiment, *places, *merged_by_name, *of_file_alone
     }  # fmt: skip

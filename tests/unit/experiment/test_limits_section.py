@@ -12,7 +12,7 @@ from afspm.model.snapshot import from_plain, to_plain
 from afspm.scheduler.safety.limit_checker import LimitChecker
 from afspm.scheduler.safety.limits import ExperimentLimits
 
-from .conftest import Write, errors, line_of, only_error
+from .conftest import FRAME, Write, errors, line_of, only_error
 
 CORRECTOR = '[repair]\ncomponent = true\nclass = "parts.Corrector"\n'
 BIAS = "[limits.tip-bias-voltage]\n"
@@ -311,3 +311,63 @@ def test_role_bounds_parameters_of_an_instrument_in_their_written_unit(write: Wr
     assert not errors(experiment)
     limit = experiment.resolved.limits.roles["repair"].limits.parameters["magnet.field"]
     assert (limit.low, limit.high, limit.unit) == (-500.0, 500.0, "mT")
+
+
+# --- movers ---
+
+MOTOR = """
+[limits.movers]
+retraction = 40
+x-coarse-away = { direction = "away", steps = 20, total = 2000 }
+x-coarse-left = { direction = "lateral", steps = 20, total = 200 }
+"""
+SIMULATED = FRAME[: FRAME.index("[microscope]")] + '[microscope]\ncomponent = true\nclass = "Simulator"\n'
+LAB = '[lab]\ncomponent = true\nclass = "Instrument"\naddress = "secop://127.0.0.1:1"\nparameters = { "lab.x" = "x" }\n'
+STAGE = '[limits."lab.x"]\nstep = "100 um"\n[limits.movers."lab.x"]\ndirection = "lateral"\ntotal = "1 mm"\n'
+
+
+def test_movers_reach_the_scheduler_with_their_rules(write: Write) -> None:
+    experiment = write(LAB + MOTOR + STAGE, frame=SIMULATED)
+    assert not errors(experiment)
+    limits = experiment.resolved.limits
+    found = limits.movers
+    assert (found.retraction, found.approach) == (40, "x-approach")
+    assert found.undeclared == ("x-coarse-down", "x-coarse-right", "x-coarse-up")
+    assert (found.movers["lab.x"].total, found.movers["lab.x"].unit) == (1000.0, "um")
+    assert found.movers["x-coarse-away"].steps == 20
+    assert limits.forbid.keys() == {
+        *(f"changes({one}) and x-engaged" for one in found.movers),
+        *(f"changes({one}) and lab.x.busy" for one in ("x-engage", "x-approach")),
+    }
+    assert from_plain(ExperimentLimits, json.loads(json.dumps(to_plain(limits)))) == limits
+
+
+@pytest.mark.parametrize(
+    ("changed", "to", "what"),
+    [
+        ("retraction = 40\n", "", "retraction is the number of steps away"),
+        ("retraction = 40", "retraction = 0", "retraction is the number of steps away"),
+        ('"lateral", steps = 20', '"sideways", steps = 20', "direction = 'sideways'"),
+        ('"lateral", steps = 20', '"lateral"', "steps: the steps of one action"),
+        ("x-coarse-left", "x-coarse-lift", "there is no action or instrument's parameter 'x-coarse-lift'"),
+        (", total = 200 }", " }", "total = None is not a quantity"),
+        ('[limits."lab.x"]\nstep = "100 um"\n', "", "a stage needs a longest way of one request"),
+        ('"lab.x"]\ndirection = "lateral"', '"lab.x"]\ndirection = "away"', "direction = 'away'"),
+    ],
+)
+def test_wrong_mover_is_refused(write: Write, changed: str, to: str, what: str) -> None:
+    text = LAB + MOTOR + STAGE
+    assert changed in text
+    assert what in only_error(write(text.replace(changed, to), frame=SIMULATED)).what
+
+
+def test_movers_need_a_microscope_that_shows_its_tip(write: Write) -> None:
+    park = SIMULATED.replace("Simulator", "Park")
+    found = only_error(write(LAB + "[limits.movers]\nretraction = 40\n" + STAGE, frame=park))
+    assert "never shows whether its tip is withdrawn" in found.what
+
+
+def test_coarse_motor_that_is_no_mover_is_named(write: Write) -> None:
+    frame = SIMULATED.replace("Simulator", "Nanonis") + 'actions = { OUT = { command = "Motor.StartMove 4 10 0 1" } }\n'
+    found = [one.what for one in write("", frame=frame).check() if "OUT" in one.what]
+    assert found == ["[microscope] actions.OUT moves the coarse motor, and is refused until it is a mover"]
