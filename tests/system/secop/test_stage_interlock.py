@@ -39,15 +39,30 @@ def stage() -> Stage:
     return Stage()
 
 
+MOVER = """parameters = { "lab.stage-x" = "stage" }
+
+[limits."lab.stage-x"]
+step = "5 mm"
+
+[limits.movers]
+retraction = 40
+x-coarse-away = { direction = "away", steps = 20, total = 2000 }
+
+[limits.movers."lab.stage-x"]
+direction = "lateral"
+total = "20 mm"
+"""
+
+
 @pytest.fixture
-def scope(tmp_path: Path, stage: Stage) -> Iterator[afspm.Scope]:
+def scope(tmp_path: Path, stage: Stage, request: pytest.FixtureRequest) -> Iterator[afspm.Scope]:
     sample: Any = loaded()
     modules = {"stage": sample.Module("stage", "mm", get=lambda: stage.mm, set=stage.go_to)}
     with sample.Server(modules, port=0) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         text = EXPERIMENT.replace("PORT", str(server.server_address[1]))
         head, _, _ = text.rpartition("parameters =")
-        with running(tmp_path, head + STAGE) as made:
+        with running(tmp_path, head + getattr(request, "param", STAGE)) as made:
             yield made
         stage.may_arrive.set()
         server.shutdown()
@@ -72,3 +87,31 @@ def test_stage_moves_only_while_the_tip_is_withdrawn_and_the_tip_returns_when_it
         assert scope.set("lab.stage-x", 3.0, "mm", wait=True) == pytest.approx(3.0)
         scope.action("x-engage")
         assert scope.wait_until(lambda: scope.tip is not None and scope.tip.engaged is True, timeout_s=DEADLINE_S)
+
+
+@pytest.mark.parametrize("scope", [MOVER], indirect=True)
+def test_stage_moves_under_a_retracted_tip_and_nothing_is_measured_before_the_approach(
+    scope: afspm.Scope, stage: Stage
+) -> None:
+    stage.may_arrive.set()
+    assert measured(scope, "lab.stage-x") == 0.0
+    with scope.control():
+        with pytest.raises(Refused, match="0 of 40 steps away"):
+            scope.set("lab.stage-x", 3.0, "mm")
+        scope.withdraw("x-coarse-away", "x-coarse-away", timeout_s=DEADLINE_S)
+        stage.may_arrive.clear()
+        scope.set("lab.stage-x", 3.0, "mm")
+        with pytest.raises(Refused, match=r"x-approach is forbidden while lab\.stage-x\.busy = true"):
+            scope.action("x-approach")
+        stage.may_arrive.set()
+        assert scope.set("lab.stage-x", 3.0, "mm", wait=True) == pytest.approx(3.0)
+        with pytest.raises(Refused, match="does not read at the sample since: approach it"):
+            scope.scan(shape=(8, 8))
+        scope.approach(timeout_s=DEADLINE_S)
+        scope.scan(shape=(8, 8))
+    away = ["x-coarse-away"] * 2
+    with scope.sweep({"lab.stage-x": ["1 mm", "2 mm"]}, shape=(8, 8), withdraw=away, timeout_s=DEADLINE_S) as points:
+        assert [point.values["lab.stage-x"] for point in points] == [pytest.approx(1e-3), pytest.approx(2e-3)]
+    assert stage.mm == pytest.approx(3.0), "it is set back, under a retracted tip"
+    assert scope.tip is not None
+    assert scope.tip.engaged is False
