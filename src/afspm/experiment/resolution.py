@@ -154,6 +154,12 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
     resolved.conditions = conditions_section.ConditionsReader(
         document, resolved.instruments, reader.actions, resolved.problems
     ).read(parts.sections.get("conditions", {}))
+    drifts = any(DRIFT in scheduler.declared.publishes for scheduler in resolved.with_role(Role.SCHEDULER))
+    lateral = [name for name, one in resolved.limits.movers.movers.items() if one.direction == "lateral"]
+    for name in lateral if drifts else ():
+        what = f"[limits.movers] {name} moves the sample along, and sample coordinates of before do not hold after it"
+        hint = 'take the scheduler without drift correction: class = "Scheduler"'
+        document.error(what, "limits", "movers", name, hint=hint)
     for translator in translators:
         for action, reason in planned_measurements.refused_actions(resolved.limits):
             what = f"[{translator.name}] actions: the limits would always refuse {reason}"

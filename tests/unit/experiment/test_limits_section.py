@@ -371,3 +371,12 @@ def test_coarse_motor_that_is_no_mover_is_named(write: Write) -> None:
     frame = SIMULATED.replace("Simulator", "Nanonis") + 'actions = { OUT = { command = "Motor.StartMove 4 10 0 1" } }\n'
     found = [one.what for one in write("", frame=frame).check() if "OUT" in one.what]
     assert found == ["[microscope] actions.OUT moves the coarse motor, and is refused until it is a mover"]
+
+
+def test_lateral_mover_is_refused_beside_sample_coordinates(write: Write) -> None:
+    drift = '[scheduler]\ncomponent = true\nclass = "DriftCompensatedScheduler"\n'
+    frame = drift + SIMULATED[SIMULATED.index("[microscope]") :]
+    found = only_error(
+        write('[control]\nsolved_by_hand = ["thermal-drift", "device-malfunction"]\n' + MOTOR, frame=frame)
+    )
+    assert "x-coarse-left moves the sample along, and sample coordinates of before do not hold" in found.what
