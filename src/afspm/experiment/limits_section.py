@@ -50,14 +50,14 @@ from afspm.experiment.findings import nearest
 from afspm.experiment.sections import Section, parse
 from afspm.experiment.toml_lines import Table
 from afspm.experiment.validation_messages import name_of, report
-from afspm.model import Parameter, Region, component_of, names
+from afspm.model import Parameter, Region, ScopeState, component_of, names
 from afspm.model.bias import BiasReference
 from afspm.model.instruments import instrument_of, split
 from afspm.scheduler import ExperimentLimits
 from afspm.scheduler.safety import rule_language
 from afspm.scheduler.safety.forbidden_states import NEVER_REFUSED, STATES
 from afspm.scheduler.safety.limits import ForbiddenState, Limit, RoleLimits, bounds, limit_key
-from afspm.scheduler.safety.movers import Direction, Mover, MoverSettings
+from afspm.scheduler.safety.movers import MEASURES, Direction, Mover, MoverSettings
 from afspm.scheduler.safety.rule_language import RuleComparison, RuleError, RuleSwitch, RuleTree
 
 Quantity = str | float
@@ -102,6 +102,7 @@ _SWEPT: Final = (
 )
 _OWN: Final = (*LimitsSection.model_fields, "actions", "roles", "forbid", "movers")
 _DIRECTIONS: Final = get_args(Direction)
+_NO_MOVERS: Final = (*names.EXTENSION_ACTIONS, *names.OF_HELD_Z_ACTIONS)
 _OF_MOVER: Final = ("direction", "steps", "total")
 _TYPES: Final = {
     **dict.fromkeys((names.FEEDBACK_ON, names.ENGAGED), "bool"),
@@ -389,7 +390,9 @@ class LimitsReader:
 
     def _mover(self, name: str, table: object, limits: Mapping[str, Limit]) -> Mover | None:
         path = ("limits", "movers", name)
-        is_action, of_instrument = name in self._known_actions, name in self._known_parameters and instrument_of(name)
+        of_instrument = name in self._known_parameters and instrument_of(name)
+        is_any = self.actions is None and not of_instrument  # of a translator that is a program of its own
+        is_action = (is_any or name in self._known_actions) and name not in (*names.BASE_ACTIONS, *_NO_MOVERS)
         if not is_action and not of_instrument:
             hint = nearest(name, [*self._known_actions, *(one for some in self.instruments.values() for one in some)])
             self.document.error(
@@ -421,7 +424,9 @@ class LimitsReader:
     def _rules_of(movers: MoverSettings) -> dict[str, ForbiddenState]:
         rules = [(name, f"{rule_language.change_of(name)} and {names.ENGAGED}") for name in movers.movers]
         stages = [name for name, mover in movers.movers.items() if mover.steps is None]
-        rules += [(one, f"{rule_language.change_of(act)} and {one}.busy") for one in stages for act in names.APPROACHES]
+        rules += [(one, f"{rule_language.change_of(one)} and {ScopeState.COARSE_MOTOR.name}") for one in stages]
+        needs_rest = (*names.APPROACHES, names.FEEDBACK_ON, *sorted(MEASURES))
+        rules += [(one, f"{rule_language.change_of(act)} and {one}.busy") for one in stages for act in needs_rest]
         return {rule: ForbiddenState(rule, source=movers.movers[name].source) for name, rule in rules}
 
     def _roles(self, table: object, limits: Mapping[str, Limit]) -> dict[str, RoleLimits]:

@@ -24,6 +24,8 @@ from afspm.scheduler.requests.forwarder import Forwarder
 from afspm.scheduler.requests.pending_requests import PendingRequests
 from afspm.scheduler.safety.grants import GrantChecker
 from afspm.scheduler.safety.limit_checker import LimitChecker
+from afspm.scheduler.safety.limit_state import LimitState
+from afspm.scheduler.safety.movers import MoverState
 from afspm.scheduler.safety.watchdog import Watchdog
 from afspm.scheduler.saved_state import SavedState
 from afspm.scheduler.settings import SchedulerSettings
@@ -87,7 +89,10 @@ class SchedulerState:
             idempotency=IdempotencyCache(),
             pending=PendingRequests(),
             forwarder=Forwarder(control.request_timeout_s, waits.answer_s, waits.longest_queue),
-            limits=LimitChecker(settings.instruments.unrated(settings.limits)),
+            limits=LimitChecker(
+                settings.instruments.unrated(settings.limits),
+                LimitState(movers=MoverState(is_unproved=bool(settings.limits.movers.movers))),
+            ),
             instruments=Instruments(settings.instruments),
             microscope=MicroscopeStatus(dog.dangerous, control.malfunction_after_s),
             watchdog=Watchdog(dog),

@@ -11,6 +11,7 @@ from afspm.model import (
     ControlMode,
     ControlRequest,
     ControlResponse,
+    Feedback,
     Parameter,
     Response,
     ResponseDetail,
@@ -94,7 +95,12 @@ class Motor:
 
 @pytest.fixture
 def motor() -> Motor:
-    return Motor()
+    """A run whose tip was proved at the sample."""
+    made = Motor()
+    assert made.refusal(names.START_SCAN).again_ns is not None
+    made.lab.later(experiment_s=1.0)
+    made.does(names.START_SCAN)
+    return made
 
 
 def test_motor_moves_only_a_tip_that_reads_as_withdrawn(motor: Motor) -> None:
@@ -130,7 +136,9 @@ def test_steps_away_are_forgotten_when_the_tip_moves_otherwise(motor: Motor, act
     motor.does(AWAY)
     motor.does(AWAY)
     if action == names.ENGAGE:
-        assert "x-engage may not reach: approach it (x-approach)" in motor.refusal(action).reason
+        why = motor.refusal(action).reason
+        assert why.startswith("x-engage may not reach the sample")
+        assert why.endswith("approach (x-approach)")
         return
     motor.does(action)
     assert "0 of 40" in motor.refusal(RIGHT).reason
@@ -162,7 +170,7 @@ def test_undeclared_motor_is_refused(motor: Motor) -> None:
 def test_nothing_is_measured_after_a_move_before_the_tip_was_read_twice(motor: Motor, code: ControlResponse) -> None:
     motor.withdraws()
     motor.does(AWAY, code)
-    assert "the tip does not read at the sample since: approach it" in motor.refusal(names.START_SCAN).reason
+    assert "has moved since the last approach: approach (x-approach)" in motor.refusal(names.START_SCAN).reason
     motor.lands()
     first = motor.refusal(names.START_SCAN)
     assert "a second reading is awaited" in first.reason
@@ -189,8 +197,13 @@ def test_current_far_from_the_setpoint_is_no_landing(motor: Motor) -> None:
     read = {"x-engaged": Parameter("x-engaged", "true"), "zctrl-setpoint": Parameter("zctrl-setpoint", "1e-10", "A")}
     for amperes, is_there in (("9e-11", True), ("-9e-11", True), ("1e-12", False), ("3e-10", False), ("nan", False)):
         values = {**read, "x-current": Parameter("x-current", amperes, "A")}
-        shown = MoverState(is_unproved=True).shown(values, 1)
+        shown = MoverState(is_unproved=True).read(values, 1)
         assert (shown.at_sample_ns is not None) is is_there, amperes
+    for setpoint, unit in (("0", "A"), ("", "A"), ("-1e-10", "A"), ("0", "V")):
+        values = {**read, "x-current": Parameter("x-current", "9e-11", "A")}
+        values["zctrl-setpoint"] = Parameter("zctrl-setpoint", setpoint, unit)
+        shown = MoverState(is_unproved=True).read(values, 1)
+        assert (shown.at_sample_ns is not None) is (setpoint == "-1e-10" or unit == "V"), (setpoint, unit)
 
 
 def test_state_survives_a_kill(motor: Motor) -> None:
@@ -206,6 +219,9 @@ def test_word_of_a_person_stands_for_the_steps_until_the_next_approach(motor: Mo
     assert motor.lab.says("experiment", ACTION, names.TIP_IS_CLEAR) == ControlResponse.NOT_IN_CONTROL
     motor.lab.mode("page", ControlMode.MANUAL)
     assert motor.lab.says("experiment", ACTION, names.TIP_IS_CLEAR) == ControlResponse.NOT_IN_CONTROL
+    motor.lab.publish("TipStatus", TipStatus(engaged=True))
+    assert motor.lab.says("page", ACTION, names.TIP_IS_CLEAR) == ControlResponse.ACTION_ERROR
+    motor.lab.publish("TipStatus", TipStatus(engaged=False))
     assert motor.lab.says("page", ACTION, names.TIP_IS_CLEAR) == ControlResponse.SUCCESS
     motor.lab.mode("page", ControlMode.AUTOMATED)
     motor.lab.take_control("experiment")
@@ -217,7 +233,9 @@ def test_word_of_a_person_stands_for_the_steps_until_the_next_approach(motor: Mo
 
 def test_stage_of_another_instrument_counts_its_way() -> None:
     settings = LIMITS.movers
-    state = MoverState(retracted=40).sent(STAGE, 2.0).sent(STAGE, 2.0)
+    state = MoverState(retracted=40)
+    for request in ("a", "b"):
+        state = state.sent(settings, STAGE, 2.0, request, is_repeated=False)
     assert state.refusal(settings, STAGE, 1.0) == ""
     assert "would go 1.5 mm after 4 mm, and at most 5 mm in a run" in state.refusal(settings, STAGE, 1.5)
 
@@ -232,3 +250,80 @@ def test_approach_by_the_motor_is_proved_even_without_a_move(motor: Motor) -> No
     motor.does(names.ENGAGE)  # by the piezo
     motor.tip = {"x_engaged": "true"}
     motor.does(names.START_SCAN)
+
+
+def test_run_begins_without_a_proof() -> None:
+    motor = Motor()
+    assert "the tip reads at the sample for less than 1 s" in motor.refusal(names.START_SCAN).reason
+    away = Motor()
+    away.tip = {"x_engaged": "false"}
+    assert "the tip does not read at the sample" in away.refusal(names.START_SCAN).reason
+    assert "x-engage may not reach the sample" in away.refusal(names.ENGAGE).reason
+
+
+def test_late_answer_and_the_answer_to_its_repetition_count_once(motor: Motor) -> None:
+    motor.withdraws()
+    motor.does(AWAY, ControlResponse.NO_RESPONSE)
+    asked = f"experiment/1/{motor.number}"
+    motor.lab.ask("experiment", ACTION, AWAY, asked)
+    motor.lab.answer_reads(**motor.tip)
+    flight = motor.lab.in_flight()
+    assert flight is not None
+    motor.lab.answer(flight)
+    motor.lab.scope_is(ScopeState.FREE)
+    assert motor.state.retracted == 20
+
+
+def test_steps_of_before_an_approach_do_not_count_after_it(motor: Motor) -> None:
+    motor.withdraws()
+    motor.does(AWAY, ControlResponse.NO_RESPONSE)
+    asked = f"experiment/1/{motor.number}"
+    motor.lands()
+    motor.withdraws()
+    motor.lab.ask("experiment", ACTION, AWAY, asked)  # the translator answers from memory
+    motor.lab.answer_reads(**motor.tip)
+    flight = motor.lab.in_flight()
+    assert flight is not None
+    motor.lab.answer(flight)
+    motor.lab.scope_is(ScopeState.FREE)
+    assert "0 of 40" in motor.refusal(RIGHT).reason
+
+
+def test_steps_count_when_they_are_made(motor: Motor) -> None:
+    motor.withdraws()
+    motor.does(AWAY)
+    motor._asked(AWAY)
+    flight = motor.lab.in_flight()
+    assert flight is not None
+    motor.lab.answer(flight)  # accepted
+    motor.lab.scope_is(ScopeState.COARSE_MOTOR)
+    assert motor.state.retracted == 20
+    motor.lab.scope_is(ScopeState.INTERRUPTED)
+    motor.lab.scope_is(ScopeState.FREE)
+    assert "20 of 40" in motor.refusal(RIGHT).reason
+
+
+def test_feedback_brings_no_tip_to_a_sample_that_has_moved(motor: Motor) -> None:
+    motor.goes_right()
+    asked = "experiment/1/on"
+    effects = motor.lab.ask("experiment", ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True), asked)
+    effects = effects + motor.lab.answer_reads(**motor.tip)
+    (refused,) = [one.response for one in replies(effects) if one.response.id == asked]
+    assert "the feedback would bring the tip to the sample" in refused.reason
+    motor.lands()
+    motor.lab.ask("experiment", ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True), "experiment/1/there")
+    motor.lab.answer_reads(**motor.tip)
+    flight = motor.lab.in_flight()
+    assert flight is not None
+    assert flight.request.subject == Feedback(on=True)
+
+
+def test_tip_that_reads_at_the_sample_needs_an_approach_after_a_move(motor: Motor) -> None:
+    motor.goes_right()
+    motor.tip = {"x_engaged": "true"}
+    assert "since the last approach" in motor.refusal(names.START_SCAN).reason
+    motor.lab.mode("page", ControlMode.MANUAL)
+    motor.lab.publish("TipStatus", TipStatus(engaged=True))  # a person has approached
+    motor.lab.mode("page", ControlMode.AUTOMATED)
+    motor.lab.take_control("experiment")
+    assert motor.refusal(names.START_SCAN).again_ns is not None

@@ -27,6 +27,7 @@ from afspm.scheduler.events import PacketIn, Publish
 from afspm.scheduler.publishing.event_log import panel_entry
 from afspm.scheduler.requests import approvals
 from afspm.scheduler.safety import safety_commands
+from afspm.scheduler.safety.movers import MoverState
 from afspm.scheduler.state import StateDraft
 from afspm.wire.messages import CONTROL_STATE
 
@@ -92,7 +93,9 @@ def _update_state(draft: StateDraft, published: object) -> None:
             safety_commands.send(draft)
     elif isinstance(published, TipStatus):
         draft.panel = replace(draft.panel, tip=published)
-        draft.limits = draft.limits.tip_shown(published.engaged, draft.now_ns)
+        if published.engaged:
+            is_by_hand = draft.control.mode is ControlMode.MANUAL
+            draft.limits = draft.limits.with_movers(MoverState.by_hand if is_by_hand else MoverState.near)
         if published.remedy:  # the act itself may have been lost with its translator
             _give_to_person(draft, published.by_hand)
     elif isinstance(published, ActByHand):
@@ -102,6 +105,7 @@ def _update_state(draft: StateDraft, published: object) -> None:
 
 
 def _take_act(draft: StateDraft, act: ActByHand) -> None:
+    draft.limits = draft.limits.with_movers(MoverState.near)
     draft.limits = draft.limits.seen(Parameter(one.parameter, one.after, one.unit or None) for one in act.changes)
     is_manual = draft.control.mode is ControlMode.MANUAL
     for one in act.changes:
@@ -126,6 +130,10 @@ def _give_to_person(draft: StateDraft, why: str) -> None:
 def _update_scope_state(draft: StateDraft, state: ScopeState) -> None:
     before = draft.microscope
     draft.microscope = before.with_state(state, draft.now_s)
+    if state is ScopeState.FREE:
+        draft.limits = draft.limits.with_movers(MoverState.free)
+    elif state is ScopeState.INTERRUPTED:
+        draft.limits = draft.limits.with_movers(MoverState.interrupted)
     draft.watchdog = draft.watchdog.state_reported(draft.microscope)
     approvals.state_changed(draft, before)
     if draft.microscope.is_free != before.is_free:

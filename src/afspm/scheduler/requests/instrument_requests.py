@@ -41,6 +41,7 @@ from afspm.scheduler.requests import answers, approvals
 from afspm.scheduler.requests.forwarder import ForwardedRequest, ReadForOrder
 from afspm.scheduler.safety.forbidden_states import judging, to_read
 from afspm.scheduler.safety.limit_checker import is_get
+from afspm.scheduler.safety.movers import MoverState
 from afspm.scheduler.safety.present_state import present_state
 from afspm.scheduler.state import SchedulerState, StateDraft
 from afspm.wire.messages import INSTRUMENT_READINGS
@@ -128,6 +129,9 @@ def take_report(draft: StateDraft, event: RequestIn, report: InstrumentReadings,
     for reading in report.readings:
         if reading.target is not None and reading.name in draft.limits.limits.bounded:
             target = Parameter(reading.name, repr(reading.target), reading.unit or None)
+            if draft.instruments.first(name) is None and draft.limits.seems_moved(reading.name, reading.target):
+                draft.log("WARNING", f"{reading.name} has another target, which the run has not set: approach again")
+                draft.limits = draft.limits.with_movers(MoverState.moved_by_others)
             draft.limits = draft.limits.in_force(target, draft.now_ns, was_read=True)
     _publish(draft, report)
     order = _next_order(draft, name, may_send)
@@ -208,6 +212,8 @@ def _limit_refusal(draft: StateDraft, waiting: OpenOrder) -> Response | None:
     if reading.value is None:
         why = f"{request.subject.name} can't be set while its value is not known: {reading.reason}"
         return Response(int(ControlResponse.PARAM_ERROR), b"", why, request.id)
+    if draft.microscope.is_free:
+        draft.limits = draft.limits.with_movers(MoverState.free)
     refusal = draft.limits.check(job.client, request, draft.now_ns, is_repeated=job.is_repeated)
     read = waiting.read if draft.forwarder.up else {}
     return refusal or draft.limits.check_forbidden(request, present_state(draft, read))
@@ -232,7 +238,7 @@ def _hand_out(draft: StateDraft, instrument: str, waiting: OpenOrder) -> Instrum
         "" if limit is None or rate_per_s is None else limit.unit or "",
     )
     sent = job._replace(sent_s=draft.now_s, sent_ns=draft.now_ns)
-    draft.limits = draft.limits.sending(job.client, job.request, draft.now_ns)
+    draft.limits = draft.limits.sending(job.client, job.request, draft.now_ns, is_repeated=job.is_repeated)
     approvals.sending(draft, job)
     if job.request.id and draft.limits.counts(job.request):
         draft.idempotency = draft.idempotency.sent(job.client, job.request)
@@ -260,6 +266,11 @@ def _settle(draft: StateDraft, instrument: str, found: OpenOrder, outcome: Order
         # its target in force: controllers round
         in_force = wanted if target.target is None else Parameter(wanted.name, repr(target.target), target.unit or None)
         payload = draft.env.codec.encode(in_force)
+    elif outcome.response == ControlResponse.NO_RESPONSE:
+        draft.limits = draft.limits.unknown(job.request)
+        response = Response(outcome.response, b"", outcome.reason, job.request.id, ResponseDetail.OUTCOME_UNKNOWN)
+        answers.finish(draft, job, response, RequestStatus.UNKNOWN)
+        return
     answers.finish(draft, job, Response(outcome.response, payload, outcome.reason, job.request.id))
 
 

@@ -70,6 +70,7 @@ from afspm.scheduler.requests.pending_requests import PrePositioner, Turn
 from afspm.scheduler.safety import present_state, safety_commands
 from afspm.scheduler.safety.forbidden_states import STARTED
 from afspm.scheduler.safety.limit_checker import is_get
+from afspm.scheduler.safety.movers import MoverState
 from afspm.scheduler.state import StateDraft
 
 _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
@@ -105,7 +106,11 @@ def handle(draft: StateDraft, event: RequestIn) -> None:
 
 
 def _take_word(draft: StateDraft, event: RequestIn) -> None:
-    draft.limits = draft.limits.tip_is_clear()
+    if draft.panel.tip.engaged is not False:
+        why = "the tip is not shown as withdrawn: withdraw it, and move it away"
+        answers.answer(draft, event, ControlResponse.ACTION_ERROR, why)
+        return
+    draft.limits = draft.limits.with_movers(lambda state: replace(state, is_clear=True))
     draft.log("WARNING", f"{event.name} says that the tip is far enough from the sample for lateral moves")
     answers.answer(draft, event, ControlResponse.SUCCESS)
 
@@ -396,7 +401,9 @@ def _send(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None
     if job.command:
         draft.pending = replace(draft.pending, turn=None)
     if job.command and not reads(request):
-        draft.limits = draft.limits.sending(name, job.outgoing, draft.now_ns, _names_meant(job))
+        draft.limits = draft.limits.sending(
+            name, job.outgoing, draft.now_ns, _names_meant(job), is_repeated=job.is_repeated
+        )
         present_state.sending(draft, job.outgoing)
         approvals.sending(draft, job)
         _restart_lease(draft, name)
@@ -548,6 +555,8 @@ def _apply_read_values(draft: StateDraft, turn: Turn) -> None:
     # only now: packets that arrived during the reads may be older than the values read
     if not turn.values:
         return
+    if draft.microscope.is_free:
+        draft.limits = draft.limits.with_movers(MoverState.free)
     draft.limits = draft.limits.was_read(turn.values, draft.now_ns)
     position = draft.limits.state.position
     if position.region is not None and names.SCAN_SIZE_X in turn.values:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple
@@ -50,10 +50,11 @@ from afspm.scheduler.safety import forbidden_states, movers
 from afspm.scheduler.safety.forbidden_states import PresentState
 from afspm.scheduler.safety.limit_state import LastUse, LimitState, Usage
 from afspm.scheduler.safety.limits import ExperimentLimits, ForbiddenState, Limit
-from afspm.scheduler.safety.movers import MoverState
+from afspm.scheduler.safety.movers import MoverSettings, MoverState
 from afspm.scheduler.safety.parameter_values import ParameterValue, ParameterValueError, numbers, values_of
 
 _REACH = 1e-9  # relative: a value on the border, to the precision of the arithmetic, is inside
+_ROUNDED = 0.01  # of the largest step of a stage: how far it rounds a target
 _TOLD_REACH = 1e-3  # the same for a place read from a controller, which rounds to its steps and to single precision
 _PLACES = ((frozenset(REGION_CHANGES), frozenset({names.START_SCAN})), (frozenset(PROBE_CHANGES), names.AT_PROBE))
 """The parameters of each place, with the actions that happen there."""
@@ -198,8 +199,8 @@ class LimitChecker:
             needed += [name for name in of_action if name in limited and limited[name].is_of_a_number]
             if self._is_curve(request):
                 needed += self._ends_to_read()
-            if self.state.movers.is_unproved and request.subject in movers.MEASURES:
-                needed += movers.SIGNAL
+        if self.state.movers.is_unproved and (request.subject in movers.MEASURES or self._switches_on(request)):
+            needed += movers.SIGNAL
         if self.limits.region is not None or is_mapped:
             action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
             for place, actions in _PLACES:
@@ -254,17 +255,18 @@ class LimitChecker:
         read = replace(self, state=replace(self.state, last_seen=others))
         read = read.seen(value for value in values.values() if value is not None)
         if names.ENGAGED in values:
-            read = read._with_movers(read.state.movers.shown(values, now_ns, proves=True))
+            read = read._with_movers(read.state.movers.read(values, now_ns))
         return read._with_state(usage, self.state.position.was_read(numbers_read))
 
-    def tip_shown(self, engaged: bool | None, now_ns: int) -> LimitChecker:
-        """Store the published state of the tip."""
-        shown = {names.ENGAGED: Parameter(names.ENGAGED, "true" if engaged else "false")}
-        return self if engaged is None else self._with_movers(self.state.movers.shown(shown, now_ns))
+    def with_movers(self, change: Callable[[MoverState], MoverState]) -> LimitChecker:
+        """Store what was seen of the movers and the tip."""
+        return self._with_movers(change(self.state.movers))
 
-    def tip_is_clear(self) -> LimitChecker:
-        """Store a person's word that the tip is far enough from the sample for a lateral move."""
-        return self._with_movers(replace(self.state.movers, is_clear=True))
+    def seems_moved(self, name: str, target: float) -> bool:
+        """Return whether the target of a stage is another one than the run has set."""
+        mover, known = self.limits.movers.movers.get(name), self.state.usage.known.get(name)
+        step = self.limits.parameters[name].step if name in self.limits.parameters else None
+        return mover is not None and known is not None and abs(target - known.value) > _ROUNDED * (step or 0.0)
 
     def _with_movers(self, state: MoverState) -> LimitChecker:
         if not self.limits.movers.movers or state == self.state.movers:
@@ -286,6 +288,15 @@ class LimitChecker:
                 found.append((name, 0.0 if before is None else abs(value - before.value)))
         return found
 
+    def _switches_on(self, request: Request) -> bool:
+        values = (forbidden_states.values_in(subject).get(names.FEEDBACK_ON) for subject in self._set_by(request))
+        return any(value is not None and (value.value or "").lower() in names.ON_WORDS for value in values)
+
+    @property
+    def _reads_engaged(self) -> bool:
+        seen = self.state.last_seen.get(names.ENGAGED)
+        return seen is not None and (seen.value or "").lower() in names.ON_WORDS
+
     def _check_movers(self, request: Request) -> None:
         settings, state = self.limits.movers, self.state.movers
         for name, way in self._moves(request):
@@ -300,8 +311,9 @@ class LimitChecker:
             if why:
                 raise _Breach(ControlResponse.ACTION_ERROR, f"{action}: {why}", again_ns)
         if action in names.APPROACHES and state.is_unproved and action != settings.approach:
-            why = f"the sample was moved under the tip, which {action} may not reach: approach it ({settings.approach})"
-            raise _Breach(ControlResponse.ACTION_ERROR, why)
+            raise _Breach(ControlResponse.ACTION_ERROR, f"{action} may not reach the sample: {_unproved(settings)}")
+        if state.is_unproved and self._switches_on(request) and not self._reads_engaged:
+            raise _Breach(_error_of(request), f"the feedback would bring the tip to the sample: {_unproved(settings)}")
 
     def unknown(self, request: Request) -> LimitChecker:
         """Forget the values that a request of unknown outcome may have changed."""
@@ -315,16 +327,28 @@ class LimitChecker:
         """Forget the value of a parameter that could not be read."""
         return self._with_usage(self.state.usage.forget(name))
 
-    def sending(self, who: str, request: Request, now_ns: int, used: Collection[str] | None = None) -> LimitChecker:
+    def sending(
+        self,
+        who: str,
+        request: Request,
+        now_ns: int,
+        used: Collection[str] | None = None,
+        *,
+        is_repeated: bool = False,
+    ) -> LimitChecker:
         """Count the uses of a checked request that is about to be sent.
 
         The time of a change is unknown until the request has settled, so values with a limited rate are set aside.
         """
         usage, moved = self.state.usage, self.state.movers
         for name, way in self._moves(request):
-            moved = moved.sent(name, way)
+            moved = moved.sent(self.limits.movers, name, way, f"{who} {request.id}", is_repeated=is_repeated)
         if request.kind == ControlRequest.ACTION and request.subject in names.APPROACHES:
             moved = moved.approaching(self.limits.movers, str(request.subject))
+        elif self._switches_on(request):
+            moved = moved.near()
+        elif request.kind == ControlRequest.ACTION and request.subject == names.RETRACT:
+            moved = moved.withdrawn()
         for name in self._counted_uses(request, used):
             usage = usage.use_sent(name, LastUse(now_ns, who, request.id))
         for name in self.limits.rated.intersection(self.names_set_by(request)) if self.limits.rated else ():
@@ -344,7 +368,7 @@ class LimitChecker:
             usage = usage.unchanged(name)
         moved = self.state.movers
         for name, way in self._moves(request):
-            moved = moved.undone(name, way)
+            moved = moved.undone(name, way, f"{who} {request.id}")
         return self._with_usage(usage)._with_movers(moved)
 
     def carried_out(
@@ -367,11 +391,7 @@ class LimitChecker:
         usage = self.state.usage
         for name in self._counted_uses(request, used):
             usage = usage.use_done(name, LastUse(now_ns, who, request.id))
-        moved = self.state.movers
-        for name, way in self._moves(request):
-            moved = moved.done(self.limits.movers, name, way)
-        if request.kind == ControlRequest.ACTION and request.subject == names.RETRACT:
-            moved = replace(moved, retracted=0)  # it may have ended a move of the motor
+        moved = self.state.movers.done(f"{who} {request.id}") if self._moves(request) else self.state.movers
         checker = self._with_usage(usage)._with_movers(moved)
         for subject in self._set_by(request):
             # the value in the microscope's answer, rather than the one that was sent
@@ -659,6 +679,10 @@ def _unseen(kind: str, end: str, limit: Limit) -> str:
 
 def _amount_text(name: str, limit: Limit, amount: float, digits: int = 6) -> str:
     return quantity(amount, limit.unit or BASE_PARAMETERS.get(name) or "", digits)
+
+
+def _unproved(settings: MoverSettings) -> str:
+    return f"the tip is not proved there since a move, or the begin of the run: approach ({settings.approach})"
 
 
 def _error_of(request: Request) -> ControlResponse:

@@ -193,7 +193,7 @@ class ExperimentLimits:
 
     @cached_property
     def fixed(self) -> ExperimentLimits:
-        """The limits that can be checked before a run: without steps, rates and intervals.
+        """The limits that can be checked before a run: without steps, rates, intervals and movers.
 
         These depend on the values in force when a request is sent, which only the scheduler knows.
         """
@@ -201,7 +201,7 @@ class ExperimentLimits:
             name: replace(one, step=None, rate_per_s=None, interval_s=None) for name, one in self.parameters.items()
         }
         actions = {name: replace(one, interval_s=None) for name, one in self.actions.items()}
-        return replace(self, parameters=fixed, actions=actions)
+        return replace(self, parameters=fixed, actions=actions, movers=MoverSettings())
 
     @cached_property
     def bounded(self) -> frozenset[str]:

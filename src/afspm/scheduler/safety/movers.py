@@ -4,10 +4,10 @@
 | --- | --- |
 | any move | a tip that the microscope shows as withdrawn (a rule of `forbid` for each mover) |
 | a lateral move | besides, `retraction` steps away since the tip was last at the sample, or a person's word |
-| a measurement after a move | a tip read at the sample twice, `PROVED_AFTER_S` apart, the current near its setpoint |
+| a measurement | an approach after the last move; the tip read at the sample twice, the current near its setpoint |
 
-A request counts from the moment at which it is sent. With an unknown outcome, a move counts as made, and steps away do
-not. The state is kept over a restart.
+The two readings are `PROVED_AFTER_S` apart. A request counts from the moment at which it is sent. With an unknown
+outcome, a move counts as made, and steps away do not. The state is kept over a restart.
 """
 
 from __future__ import annotations
@@ -72,20 +72,26 @@ class MoverSettings:
 
 @dataclass(frozen=True)
 class MoverState:
-    """The moves since the tip was last proved at the sample.
+    """The moves since the tip was last proved at the sample. A run begins without a proof.
 
     Attributes:
         ways: the way of each mover in this run, in steps or in its unit.
-        retracted: steps away from the sample since the tip was last at the sample.
+        pending: steps away that are not answered yet, by request.
+        answered: steps away that are answered; they are made once the microscope is free.
+        retracted: steps away that were made since the tip was last at the sample.
         is_clear: whether, by the word of a person since then, the tip is far enough for a lateral move.
-        is_unproved: whether something was moved, or the motor approached, since the tip was proved at the sample.
-        at_sample_ns: the experiment time of the first of the readings that show the tip at the sample since the move.
+        is_unproved: whether the tip was not proved at the sample since a move, an approach by the motor, or the begin.
+        needs_approach: whether something was moved, and no approach has begun since.
+        at_sample_ns: the experiment time of the first of the readings that show the tip at the sample.
     """
 
     ways: Mapping[str, float] = field(default_factory=dict)
+    pending: Mapping[str, int] = field(default_factory=dict)
+    answered: int = 0
     retracted: int = 0
     is_clear: bool = False
     is_unproved: bool = False
+    needs_approach: bool = False
     at_sample_ns: int | None = None
 
     def refusal(self, settings: MoverSettings, name: str, way: float) -> str:
@@ -104,42 +110,62 @@ class MoverState:
             )
         return ""
 
-    def sent(self, name: str, way: float) -> MoverState:
-        return replace(self._with_way(name, way), is_unproved=True, at_sample_ns=None)
+    def sent(self, settings: MoverSettings, name: str, way: float, request: str, *, is_repeated: bool) -> MoverState:
+        """Count a move that is sent. A repeated one may be answered from memory, so its steps away do not count."""
+        state = replace(self, is_unproved=True, needs_approach=True, at_sample_ns=None)
+        if is_repeated:
+            return state
+        is_away = settings.movers[name].direction == "away"
+        pending = {**self.pending, request: int(way)} if is_away else self.pending
+        return replace(state._with_way(name, way), pending=pending)
 
-    def done(self, settings: MoverSettings, name: str, way: float) -> MoverState:
-        away = int(way) if settings.movers[name].direction == "away" else 0
-        return replace(self, retracted=self.retracted + away) if away else self
+    def done(self, request: str) -> MoverState:
+        """Take the answer that a move was made, or has begun."""
+        return replace(self, pending=_without(self.pending, request), answered=self.answered + self._pending(request))
 
-    def undone(self, name: str, way: float) -> MoverState:
+    def undone(self, name: str, way: float, request: str) -> MoverState:
         """Take back a request that was certainly not carried out. An approach is still needed."""
-        return self._with_way(name, -way)
+        return replace(self._with_way(name, -way), pending=_without(self.pending, request))
 
-    def _with_way(self, name: str, way: float) -> MoverState:
-        return replace(self, ways={**self.ways, name: self.ways.get(name, 0.0) + way})
+    def free(self) -> MoverState:
+        """Count the answered steps away: the microscope is free."""
+        return replace(self, retracted=self.retracted + self.answered, answered=0)
+
+    def interrupted(self) -> MoverState:
+        """Forget the answered steps away: the microscope has not made them all."""
+        return replace(self, answered=0)
+
+    def near(self) -> MoverState:
+        """Forget how far the tip was: it comes to the sample, is there, or moves as nothing here knows."""
+        return replace(self, pending={}, answered=0, retracted=0, is_clear=False)
+
+    def withdrawn(self) -> MoverState:
+        """Forget the steps away, since a withdrawal may end them."""
+        return replace(self, pending={}, answered=0, retracted=0)
 
     def approaching(self, settings: MoverSettings, action: str) -> MoverState:
-        """Forget how far the tip was: an action that brings it to the sample is sent."""
-        return replace(self._near(), is_unproved=self.is_unproved or action == settings.approach, at_sample_ns=None)
+        """Take in that an action is sent that brings the tip to the sample."""
+        if action != settings.approach:
+            return replace(self.near(), at_sample_ns=None)
+        return replace(self.near(), is_unproved=True, needs_approach=False, at_sample_ns=None)
 
-    def _near(self) -> MoverState:
-        return replace(self, retracted=0, is_clear=False)
+    def by_hand(self) -> MoverState:
+        """Take in that a person has brought the tip to the sample."""
+        return replace(self.near(), needs_approach=False)
 
-    def shown(self, values: Mapping[str, Parameter | None], now_ns: int, *, proves: bool = False) -> MoverState:
-        """Take in a reading of the tip; a second one at the sample ends the moves.
+    def moved_by_others(self) -> MoverState:
+        return replace(self, is_unproved=True, needs_approach=True, at_sample_ns=None)
 
-        Args:
-            values: of `SIGNAL`, as read.
-            proves: whether it was read for this decision, and not published some time ago.
-        """
+    def read(self, values: Mapping[str, Parameter | None], now_ns: int) -> MoverState:
+        """Take in `SIGNAL` as read for a decision; a second reading at the sample proves the tip there."""
         if not _is_on(values):
             return replace(self, at_sample_ns=None)
-        state = self._near()
-        if not self.is_unproved or not _has_signal(values):
+        state = self.near()
+        if not self.is_unproved or self.needs_approach or not _has_signal(values):
             return replace(state, at_sample_ns=None)
         if self.at_sample_ns is None:
             return replace(state, at_sample_ns=now_ns)
-        if proves and now_ns - self.at_sample_ns >= PROVED_AFTER_S * 1e9:
+        if now_ns - self.at_sample_ns >= PROVED_AFTER_S * 1e9:
             return replace(state, is_unproved=False, at_sample_ns=None)
         return state
 
@@ -147,11 +173,26 @@ class MoverState:
         """Return why nothing may be measured now, and the time at which it may be tried again; empty: it may."""
         if not self.is_unproved:
             return "", None
-        moved = "the coarse motor or a stage has moved"
+        if self.needs_approach:
+            return (
+                f"the coarse motor or a stage has moved since the last approach: approach ({settings.approach})",
+                None,
+            )
         if self.at_sample_ns is None:
-            return f"{moved}, and the tip does not read at the sample since: approach it ({settings.approach})", None
+            why = f"the tip does not read at the sample ({names.ENGAGED}, with the current near its setpoint)"
+            return f"{why}: approach ({settings.approach})", None
         again_ns = self.at_sample_ns + math.ceil(PROVED_AFTER_S * 1e9)
-        return f"{moved}, and the tip is back for less than {PROVED_AFTER_S:g} s: a second reading is awaited", again_ns
+        return f"the tip reads at the sample for less than {PROVED_AFTER_S:g} s: a second reading is awaited", again_ns
+
+    def _with_way(self, name: str, way: float) -> MoverState:
+        return replace(self, ways={**self.ways, name: self.ways.get(name, 0.0) + way})
+
+    def _pending(self, request: str) -> int:
+        return self.pending.get(request, 0)
+
+
+def _without(pending: Mapping[str, int], request: str) -> dict[str, int]:
+    return {one: steps for one, steps in pending.items() if one != request}
 
 
 def _is_on(values: Mapping[str, Parameter | None]) -> bool:
@@ -160,15 +201,18 @@ def _is_on(values: Mapping[str, Parameter | None]) -> bool:
 
 
 def _has_signal(values: Mapping[str, Parameter | None]) -> bool:
-    current, setpoint = (_amperes(values.get(name)) for name in (names.CURRENT, names.ZCTRL_SETPOINT))
-    if current is None or not setpoint:
+    current, setpoint = (values.get(name) for name in (names.CURRENT, names.ZCTRL_SETPOINT))
+    if current is None or setpoint is None or setpoint.unit != "A":
         return True  # a feedback on another signal, or a microscope that does not show its current
-    return _NEAR[0] <= abs(current / setpoint) <= _NEAR[1]
+    current_a, setpoint_a = _amperes(current), _amperes(setpoint)
+    if current_a is None or not setpoint_a:
+        return False
+    return _NEAR[0] <= abs(current_a / setpoint_a) <= _NEAR[1]
 
 
-def _amperes(shown: Parameter | None) -> float | None:
+def _amperes(shown: Parameter) -> float | None:
     try:
-        return None if shown is None or shown.unit != "A" else float(shown.value or "")
+        return float(shown.value or "") if shown.unit == "A" else None
     except ValueError:
         return None
 

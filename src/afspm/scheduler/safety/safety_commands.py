@@ -32,6 +32,7 @@ def send(draft: StateDraft) -> None:
         if job is None:
             draft.watchdog = draft.watchdog.unsent(draft.now_s)
             return
+        draft.limits = draft.limits.sending("", request, draft.now_ns)
 
 
 def leave_to_person(draft: StateDraft) -> None:
