@@ -56,10 +56,13 @@ class ConstantHeight(Component):
             raise RuntimeError(f"the tip is not stable: its current differs by {scatter:.0%} from the setpoint")
 
     def draw(self, stack):
-        figure = Figure(figsize=(2.9 * len(stack), 3.0), layout="constrained")
+        columns = min(4, len(stack))
+        rows = -(-len(stack) // columns)
+        figure = Figure(figsize=(2.9 * columns, 3.0 * rows), layout="constrained")
         figure.suptitle(self.name + ", SIMULATED" * self.simulated)
         size_nm = 1e9 * self.region.size_m[0]
-        for axes, height, scan in zip(figure.subplots(1, len(stack)), self.heights, stack, strict=True):
+        panels = figure.subplots(rows, columns, squeeze=False).flat
+        for axes, height, scan in zip(panels, self.heights, stack, strict=False):  # the last row may have free panels
             low, high = np.percentile(scan.values, [1, 99])
             factor, unit = scale(max(abs(low), abs(high)), "A")
             drawn = axes.imshow(
@@ -71,4 +74,6 @@ class ConstantHeight(Component):
             )
             axes.set(title=f"{1e12 * height:+.0f} pm", xlabel="x (nm)", ylabel="y (nm)")
             figure.colorbar(drawn, label=f"current ({unit})", shrink=0.8)
+        for free in panels:
+            free.set_axis_off()
         figure.savefig(self.run_dir / "stack.png", dpi=160)
