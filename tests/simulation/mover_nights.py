@@ -28,7 +28,7 @@ from afspm.scheduler.safety.limits import ForbiddenState
 from afspm.scheduler.safety.movers import PROVED_AFTER_S, Mover, MoverSettings
 from afspm.testing import Bench
 
-Mutant = Literal["", "tip", "retraction"]
+Mutant = Literal["", "retraction"]
 """A part of the interlock that is left out, so that a night must see it."""
 LASTS_S = 600.0
 AWAY, RIGHT, UP = "x-coarse-away", "x-coarse-right", "x-coarse-up"
@@ -102,7 +102,7 @@ def limits_without(mutant: Mutant) -> ExperimentLimits:
         AWAY: Mover("away", total, _STEPS),
         **{one: Mover("lateral", total, _STEPS) for one in (RIGHT, UP)},
     }
-    rules = [f"changes({one}) and {names.ENGAGED}" for one in _MOVES if mutant != "tip"]
+    rules = [f"changes({one}) and {names.ENGAGED}" for one in _MOVES]
     forbid = {rule: ForbiddenState(rule) for rule in rules}
     retraction = 0 if mutant == "retraction" else 60
     return ExperimentLimits(
@@ -189,7 +189,7 @@ def _in_air(lines: list[dict[str, Any]]) -> int:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("nights", type=int)
-    parser.add_argument("--without", default="", choices=["tip", "retraction"], help="leave a part out")
+    parser.add_argument("--without", default="", choices=["retraction"], help="leave a part out")
     parser.add_argument("--first", type=int, default=0)
     given = parser.parse_args()
     logging.disable(logging.CRITICAL)

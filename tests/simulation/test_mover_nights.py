@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from afspm.translator.commands import Commands
-from tests.simulation.mover_nights import Mutant, night
+from tests.simulation.mover_nights import night
 
 LASTS_S = 200.0
 
@@ -20,13 +19,8 @@ def test_no_move_strikes_the_tip(seed: int, tmp_path: Path) -> None:
     assert found.scans > 2
 
 
-@pytest.mark.parametrize("mutant", ["tip", "retraction"])
-def test_interlock_without_a_part_strikes_the_tip(
-    mutant: Mutant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if mutant == "tip":  # the translator reads the tip, too
-        monkeypatch.setattr(Commands, "_refuse_at_sample", lambda self: None)
-    assert night(3, tmp_path, mutant, LASTS_S).struck
+def test_interlock_without_a_retraction_strikes_the_tip(tmp_path: Path) -> None:
+    assert night(3, tmp_path, "retraction", LASTS_S).struck
 
 
 def test_interlock_without_a_proof_measures_in_air(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

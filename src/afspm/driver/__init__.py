@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 if TYPE_CHECKING:  # one maker's controller has it today, and another's may
     from afspm.storage.formats import igor, netcdf
     from afspm.storage.formats.content import clock_ns
-    from afspm.translator.driver_base import LOST, ControllerSilent, Introduction
+    from afspm.translator.driver_base import LOST, CoarseMove, ControllerSilent, Introduction
     from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
     from afspm.translator.parameters import ParameterSpec, refuse_value
     from afspm.translator.result_files import missing_text, newest
@@ -73,6 +73,7 @@ __all__ = [
     "TCP",
     "TRACE",
     "Activity",
+    "CoarseMove",
     "Content",
     "ControllerLost",
     "ControllerSilent",
@@ -138,7 +139,8 @@ if not TYPE_CHECKING:
             "afspm.storage.formats.content": "FileContent OtherFormat local_ns name_and_unit text_of clock_ns",
             "afspm.translator.activity": "Activity TipWay",
             "afspm.translator.driver": "Driver",
-            "afspm.translator.driver_base": "ControllerLost action connected LOST ControllerSilent Introduction",
+            "afspm.translator.driver_base": "ControllerLost action connected "
+            "LOST CoarseMove ControllerSilent Introduction",
             "afspm.translator.folder_files": "FolderFiles",
             "afspm.translator.judge": "Stated",
             "afspm.translator.long_call": "ANSWERS_S LongCall",

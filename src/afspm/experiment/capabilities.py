@@ -13,6 +13,7 @@ from afspm.model.bias import BiasReference
 
 if TYPE_CHECKING:
     from afspm.translator.driver import Driver
+    from afspm.translator.driver_base import CoarseMove
     from afspm.translator.parameters import ParameterTable, Value
 
 
@@ -28,7 +29,7 @@ class MicroscopeCapabilities:
         channels: the channels that the microscope may have, by their roles.
         never_withdrawn: actions that need a withdrawn tip, if the microscope never shows the tip.
         bias: the reference of the bias.
-        coarse: actions that move the coarse motor.
+        coarse: the moves of actions that move the coarse motor, by the action's name.
         refused_commands: the reasons and remedies why the microscope refuses commands, by the action's name.
     """
 
@@ -40,7 +41,7 @@ class MicroscopeCapabilities:
     max_pixels: int
     bias: BiasReference
     never_withdrawn: tuple[str, ...] = ()
-    coarse: tuple[str, ...] = ()
+    coarse: Mapping[str, CoarseMove] = field(default_factory=dict)
     refused_commands: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
     def refuses(self, parameter: Parameter) -> str:
@@ -70,6 +71,7 @@ class MicroscopeCapabilities:
 def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None:
     """Return the capabilities of a `Driver` class with these settings; None if they are not known before the start."""
     from afspm.translator.driver import Driver
+    from afspm.translator.driver_base import CoarseMove
 
     if not issubclass(microscope, Driver):
         return None
@@ -80,8 +82,9 @@ def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None
     ]
     added = settings.get("actions") or {}
     actions = {mark.name for mark in marks} | set(added)
-    coarse = {mark.name for mark in marks if mark.needs_withdrawn}
-    coarse |= {name for name, what in added.items() if isinstance(what, Mapping) and acting.is_coarse(what)}
+    coarse = {mark.name: CoarseMove() for mark in marks if mark.needs_withdrawn}
+    moves = {name: acting.coarse_move(what) for name, what in added.items() if isinstance(what, Mapping)}
+    coarse |= {name: move for name, move in moves.items() if move is not None}
     if acting.holds_z():
         actions |= {*names.OF_HELD_Z_ACTIONS}
     try:
@@ -95,8 +98,7 @@ def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None
         return None  # the check of its settings reports the error in the table
     units = {name: table[name].si_unit for name in table}
     most = acting.max_pixels
-    of_tip = (never, tuple(sorted(coarse)))
-    return MicroscopeCapabilities(frozenset(actions), units, sets, table, channels, most, bias, *of_tip, refused)
+    return MicroscopeCapabilities(frozenset(actions), units, sets, table, channels, most, bias, never, coarse, refused)
 
 
 def bias_given(settings: Table) -> BiasReference:

@@ -37,7 +37,7 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, TypeGuard, get_args
+from typing import TYPE_CHECKING, Any, Final, TypeGuard, get_args
 
 import pydantic
 
@@ -59,6 +59,9 @@ from afspm.scheduler.safety.forbidden_states import NEVER_REFUSED, STATES
 from afspm.scheduler.safety.limits import ForbiddenState, Limit, RoleLimits, bounds, limit_key
 from afspm.scheduler.safety.movers import MEASURES, Direction, Mover, MoverSettings
 from afspm.scheduler.safety.rule_language import RuleComparison, RuleError, RuleSwitch, RuleTree
+
+if TYPE_CHECKING:
+    from afspm.translator.driver_base import CoarseMove
 
 Quantity = str | float
 _QUANTITIES: Final = ("min", "max", "step", "rate")
@@ -123,7 +126,7 @@ class LimitsReader:
         instruments: parameters of each other instrument, whose units are known only when the instrument runs.
         types: "bool" or "text" for parameters that are no numbers.
         bias: the reference of the bias; limits on `sample-bias` become limits on `tip-bias-voltage`.
-        coarse: actions that move the coarse motor.
+        coarse: the moves of actions that move the coarse motor, by the action's name.
     """
 
     document: Document
@@ -135,7 +138,7 @@ class LimitsReader:
     instruments: Mapping[str, Collection[str]] = field(default_factory=dict)
     types: Mapping[str, str] = field(default_factory=dict)
     bias: BiasReference = field(default_factory=BiasReference)
-    coarse: tuple[str, ...] = ()
+    coarse: Mapping[str, CoarseMove] = field(default_factory=dict)
 
     @property
     def _known_actions(self) -> frozenset[str]:
@@ -385,7 +388,13 @@ class LimitsReader:
             self.document.error(what, *path, hint="leave it out, and move by hand after `afspm pause`")
         approach = names.APPROACH if names.APPROACH in self._known_actions else names.ENGAGE
         source = str(self.document.place(*path, "retraction"))
-        undeclared = tuple(one for one in self.coarse if one not in given)
+        ways = {
+            move.direction for name, move in self.coarse.items() if name in given and given[name].direction == "away"
+        }
+        if len(ways - {""}) > 1:
+            what = f"[limits.movers] the movers away from the sample go in two directions: {', '.join(sorted(ways))}"
+            self.document.error(what, *path, hint="one of them goes towards the sample: try it by hand")
+        undeclared = tuple(sorted(one for one in self.coarse if one not in given))
         return MoverSettings(given, retraction if _is_count(retraction) else 0, approach, undeclared, source)
 
     def _mover(self, name: str, table: object, limits: Mapping[str, Limit]) -> Mover | None:
@@ -412,6 +421,13 @@ class LimitsReader:
             hint = "steps = 20" if is_action else "leave it out: it is for the actions of a motor"
             self.document.error(f"[limits.movers.{name}] steps: the steps of one action", *path, hint=hint)
             return None
+        move = self.coarse.get(name)
+        if move is not None and move.is_lateral not in (None, direction == "lateral"):
+            what = f"[limits.movers.{name}] direction = {direction!r}, and its command goes {move.direction}"
+            self.document.error(what, *path, "direction", hint="write the direction of the command")
+        if move is not None and move.steps not in (None, steps):
+            what = f"[limits.movers.{name}] steps = {steps}, and its command makes {move.steps}"
+            self.document.error(what, *path, "steps", hint=f"steps = {move.steps}")
         if not is_action and (limit is None or limit.step is None):
             what = f"[limits.movers.{name}] a stage needs a longest way of one request"
             self.document.error(what, *path, hint=f'write [limits."{name}"] step = "100 um"')

@@ -136,7 +136,7 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
         actions=None if has is None else has.actions,
         sets={} if has is None else has.sets,
         certain=has is not None,
-        coarse=() if has is None else has.coarse,
+        coarse={} if has is None else has.coarse,
         types={}
         if has is None
         else {name: has.table[name].type for name in has.table if not has.table[name].is_number},

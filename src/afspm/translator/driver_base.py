@@ -91,6 +91,21 @@ _HELD_Z_ROWS: Final[Mapping[str, Mapping[str, object]]] = {
 }
 
 
+@dataclass(frozen=True)
+class CoarseMove:
+    """A move of the coarse motor or stage by a command, as far as the command shows it.
+
+    Attributes:
+        direction: the maker's name of the direction; empty if unknown.
+        is_lateral: whether it is along the sample; None if unknown.
+        steps: the number of steps; None if unknown.
+    """
+
+    direction: str = ""
+    is_lateral: bool | None = None
+    steps: int | None = None
+
+
 def _not_implemented() -> None:
     raise NotImplementedError
 
@@ -424,14 +439,15 @@ class DriverBase(ABC):
     @classmethod
     def needs_withdrawn(cls, action: Mapping[str, object]) -> bool:
         """Return whether an action of the experiment file needs a withdrawn tip."""
-        return bool(action.get("withdrawn", cls.is_coarse(action)))
+        return bool(action.get("withdrawn", cls.coarse_move(action) is not None))
 
     @classmethod
-    def is_coarse(cls, action: Mapping[str, object]) -> bool:
-        """Return whether an action of the experiment file is known to move the coarse motor or stage."""
-        command = str(action.get("command", ""))
+    def coarse_move(cls, action: Mapping[str, object]) -> CoarseMove | None:
+        """Return the move of an action of the experiment file that is known to move the coarse motor or stage."""
+        command = str(action.get("command", "")).strip()
         is_known = bool(cls.coarse_commands and re.search(cls.coarse_commands, command))
-        return is_known and action.get("withdrawn") is not False  # a person's word for a command that is safe
+        is_safe = action.get("withdrawn") is False  # a person's word for a command
+        return CoarseMove() if is_known and not is_safe else None
 
     @classmethod
     def never_withdrawn(cls, settings: PlainMapping) -> tuple[str, ...]:

@@ -130,7 +130,7 @@ def errors(tmp_path: Path, text: str) -> list[str]:
         ("LockIn.ModOnOffSet 1 -1", "-1 can't be sent as uint32"),
         ("TCPLog.ChsSet 0", "takes [int32,...], not 0"),
         ("Pattern.CloudSet 0 3 [1e-9] [0]", "it has 1 items, not 3"),
-        ("AutoApproach.OnOffSet 1", "it brings the tip to the sample: do it at Nanonis, after `afspm pause`"),
+        ("AutoApproach.OnOffSet 1", "it brings the tip to the sample: use x-approach"),
         ("ZCtrl.OnOffSet 0", "write set = { x-feedback-on = … }"),
         ("ZCtrl.ZPosSet 1e-9", "it moves z, which no limit bounds: declare a parameter"),
         ("ZCtrl.Withdraw 0 -1", "use x-retract"),

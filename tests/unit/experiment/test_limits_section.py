@@ -11,6 +11,7 @@ from afspm.model import ControlRequest, Feedback, Parameter, Request
 from afspm.model.snapshot import from_plain, to_plain
 from afspm.scheduler.safety.limit_checker import LimitChecker
 from afspm.scheduler.safety.limits import ExperimentLimits
+from afspm.scheduler.safety.movers import MEASURES
 
 from .conftest import FRAME, Write, errors, line_of, only_error
 
@@ -337,7 +338,8 @@ def test_movers_reach_the_scheduler_with_their_rules(write: Write) -> None:
     assert found.movers["x-coarse-away"].steps == 20
     assert limits.forbid.keys() == {
         *(f"changes({one}) and x-engaged" for one in found.movers),
-        *(f"changes({one}) and lab.x.busy" for one in ("x-engage", "x-approach")),
+        *(f"changes({one}) and lab.x.busy" for one in ("x-engage", "x-approach", "x-feedback-on", *MEASURES)),
+        "changes(lab.x) and COARSE_MOTOR",
     }
     assert from_plain(ExperimentLimits, json.loads(json.dumps(to_plain(limits)))) == limits
 
@@ -371,6 +373,39 @@ def test_coarse_motor_that_is_no_mover_is_named(write: Write) -> None:
     frame = SIMULATED.replace("Simulator", "Nanonis") + 'actions = { OUT = { command = "Motor.StartMove 4 10 0 1" } }\n'
     found = [one.what for one in write("", frame=frame).check() if "OUT" in one.what]
     assert found == ["[microscope] actions.OUT moves the coarse motor, and is refused until it is a mover"]
+
+
+NANONIS = SIMULATED.replace("Simulator", "Nanonis")
+
+
+@pytest.mark.parametrize(
+    ("out", "mover", "what"),
+    [
+        ("Motor.StartMove 4 10 0 1", '{ direction = "away", steps = 10, total = 200 }', ""),
+        ("Motor.StartMove 4 10 0 1", '{ direction = "away", steps = 20, total = 200 }', "its command makes 10"),
+        ("Motor.StartMove 4 10 0 1", '{ direction = "lateral", steps = 10, total = 200 }', "its command goes Z+"),
+        ("Motor.StartMove 0 10 0 1", '{ direction = "away", steps = 10, total = 200 }', "its command goes X+"),
+        ("'Motor.StartMove' 4 5 0 1", '{ direction = "away", steps = 10, total = 200 }', "its command makes 5"),
+    ],
+)
+def test_mover_is_compared_with_its_command(write: Write, out: str, mover: str, what: str) -> None:
+    frame = NANONIS + f'actions = {{ OUT = {{ command = "{out}", withdrawn = false }} }}\n'
+    found = errors(write(f"[limits.movers]\nretraction = 40\nOUT = {mover}\n", frame=frame))
+    assert [what in one.what for one in found] == ([True] if what else []), found
+
+
+def test_movers_away_go_one_way(write: Write) -> None:
+    actions = ", ".join(
+        f'{name} = {{ command = "Motor.StartMove {way} 10 0 1" }}' for name, way in (("A", 4), ("B", 5))
+    )
+    movers = "".join(f'{name} = {{ direction = "away", steps = 10, total = 200 }}\n' for name in "AB")
+    found = only_error(write(f"[limits.movers]\n{movers}", frame=NANONIS + f"actions = {{ {actions} }}\n"))
+    assert "go in two directions: Z+, Z-" in found.what
+
+
+def test_approach_and_retract_are_no_movers(write: Write) -> None:
+    mover = '[limits.movers]\nx-engage = { direction = "away", steps = 10, total = 200 }\n'
+    assert "there is no action or instrument's parameter 'x-engage'" in only_error(write(mover, frame=SIMULATED)).what
 
 
 def test_lateral_mover_is_refused_beside_sample_coordinates(write: Write) -> None:

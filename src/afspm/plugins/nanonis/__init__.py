@@ -25,6 +25,7 @@ from afspm.basics import ConfigError, Current, Duration, FileError, Refused, Vol
 from afspm.driver import (
     FRAME,
     SCAN,
+    CoarseMove,
     ControllerLost,
     Driver,
     Entry,
@@ -41,7 +42,13 @@ from afspm.driver import (
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, both_ways, names
 from afspm.plugins.nanonis import fetched, geometry, parameter_groups, protocol, z_controller
 from afspm.plugins.nanonis.activity import SAFE_TIP, WITHDRAWING, NanonisActivity
-from afspm.plugins.nanonis.experiment_functions import FunctionCall, ValueFunctions, check_row, values_commanded
+from afspm.plugins.nanonis.experiment_functions import (
+    FunctionCall,
+    ValueFunctions,
+    check_row,
+    move_of_motor,
+    values_commanded,
+)
 from afspm.plugins.nanonis.preamplifier import Preamplifier
 from afspm.plugins.nanonis.result_files import NanonisFiles
 from afspm.plugins.nanonis.session import MODULES, Link, Ports, Session, WithdrawalPort
@@ -168,7 +175,6 @@ class Nanonis(Driver):
     max_pixels: ClassVar[int] = 8192 * 8192
     program_s: ClassVar[float] = 2.0
     leaves_tip_s: ClassVar[float] = 5.0
-    coarse_commands: ClassVar[str] = r"^\s*Motor\.Start"
     never_shows: ClassVar = {
         "another one begun": "a stop and a start between two looks seem one scan, unless the stop saves a file",
     }
@@ -510,6 +516,10 @@ class Nanonis(Driver):
     @classmethod
     def commanded(cls, action: Mapping[str, object]) -> Sequence[tuple[str, Value]]:
         return values_commanded(action)
+
+    @classmethod
+    def coarse_move(cls, action: Mapping[str, object]) -> CoarseMove | None:
+        return move_of_motor(action)
 
     @classmethod
     def check_row(cls, row: ParameterSpec) -> None:

@@ -16,7 +16,7 @@ from functools import cache
 from typing import Final
 
 from afspm.basics import InvalidValue
-from afspm.driver import ParameterSpec, Value
+from afspm.driver import CoarseMove, ParameterSpec, Value
 from afspm.model import names
 from afspm.plugins.nanonis.protocol import Fields, function, function_names, request, types_text
 
@@ -76,6 +76,7 @@ _REFUSED_ACTIONS: Final[Mapping[str, str]] = {
         "its z offset moves the tip, which no limit bounds: write 0"
     ),
     r"(MProbe)?Bias\.Pulse .* [^2]$": "limits can't judge a relative pulse: write 2, absolute, as the last argument",
+    r"Motor\.StartClosedLoop": "it may go towards the sample: use Motor.StartMove",
     r"Motor\.StartMove .* 0$": "Nanonis does not show that its motor moves: write 1, wait, as the last argument",
     r"TipShaper\.Start": f"use {names.CRASH}, whose depth limits judge",
     r"Scan\.Action 0": f"use {names.START_SCAN}, which limits judge",
@@ -112,6 +113,24 @@ class FunctionCall:
         call = cls(name, _arguments(name, function(name).arguments, words))
         request(name, call.arguments)  # raises if a number does not fit its type
         return call
+
+
+_DIRECTIONS: Final = ("X+", "X-", "Y+", "Y-", "Z+", "Z-")
+
+
+def move_of_motor(action: Mapping[str, object]) -> CoarseMove | None:
+    """Return the move of the coarse motor by an action's command; None for another command."""
+    try:
+        call = FunctionCall.of(str(action.get("command", "")))
+    except InvalidValue:  # reported with the action
+        return None
+    if not call.name.startswith("Motor.Start"):
+        return None
+    if call.name != "Motor.StartMove":
+        return CoarseMove()
+    direction, steps, *_ = call.arguments
+    named = _DIRECTIONS[direction] if isinstance(direction, int) and direction < len(_DIRECTIONS) else ""
+    return CoarseMove(named, not named.startswith("Z") if named else None, steps if isinstance(steps, int) else None)
 
 
 def values_commanded(action: Mapping[str, object]) -> list[tuple[str, Value]]:
