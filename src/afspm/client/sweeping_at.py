@@ -112,6 +112,8 @@ class PlacedSweeper:
         import numpy as np  # late: most components sweep nothing, and it takes a tenth of a second
 
         link, target = self._link, sweep.target
+        if (tip := link.view.tip) is not None and tip.engaged is False:
+            raise Refused(ControlResponse.ACTION_ERROR, "the tip is withdrawn: bring it to the sample first")
         if target.at_m is not None:
             self._setup.move_probe(target.at_m, until_s, drifts=target.frame is Frame.SAMPLE)
         began_ns, rows = link.clock.now_ns(), []

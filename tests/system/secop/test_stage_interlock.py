@@ -105,8 +105,10 @@ def test_stage_moves_under_a_retracted_tip_and_nothing_is_measured_before_the_ap
             scope.action("x-approach")
         stage.may_arrive.set()
         assert scope.set("lab.stage-x", 3.0, "mm", wait=True) == pytest.approx(3.0)
-        with pytest.raises(Refused, match="does not read at the sample since: approach it"):
+        with pytest.raises(Refused, match="has moved since the last approach"):
             scope.scan(shape=(8, 8))
+        with pytest.raises(Refused, match="the tip is withdrawn"):
+            scope.sweep_at("tip-bias-voltage", ["0 V", "10 mV"], read="x-current")
         scope.approach(timeout_s=DEADLINE_S)
         scope.scan(shape=(8, 8))
     away = ["x-coarse-away"] * 2

@@ -92,10 +92,11 @@ def _update_state(draft: StateDraft, published: object) -> None:
         if draft.microscope.risk != before.risk:
             safety_commands.send(draft)
     elif isinstance(published, TipStatus):
+        is_back = published.engaged is True and draft.panel.tip.engaged is False
         draft.panel = replace(draft.panel, tip=published)
         if published.engaged:
             is_by_hand = draft.control.mode is ControlMode.MANUAL
-            draft.limits = draft.limits.with_movers(MoverState.by_hand if is_by_hand else MoverState.near)
+            draft.limits = draft.limits.with_movers(lambda state: state.at_sample(is_back=is_back, by_hand=is_by_hand))
         if published.remedy:  # the act itself may have been lost with its translator
             _give_to_person(draft, published.by_hand)
     elif isinstance(published, ActByHand):

@@ -149,9 +149,10 @@ class MoverState:
             return replace(self.near(), at_sample_ns=None)
         return replace(self.near(), is_unproved=True, needs_approach=False, at_sample_ns=None)
 
-    def by_hand(self) -> MoverState:
-        """Take in that a person has brought the tip to the sample."""
-        return replace(self.near(), needs_approach=False)
+    def at_sample(self, *, is_back: bool, by_hand: bool) -> MoverState:
+        """Take in that the tip is shown at the sample; `is_back`: it was away before."""
+        is_needed = self.needs_approach and not by_hand
+        return replace(self.near(), is_unproved=self.is_unproved or is_back, needs_approach=is_needed)
 
     def moved_by_others(self) -> MoverState:
         return replace(self, is_unproved=True, needs_approach=True, at_sample_ns=None)
