@@ -1,9 +1,8 @@
 """`python -m benchmarks.drift.fit`: fit the probabilities and the ellipses of the default estimator.
 
-Uses the fitted half of the families alone. Writes plugins/drift/doubt/coefficients.py (with `--doubt` the doubt in
-it alone), or with `--figure` a reliability diagram of the present coefficients, on both halves. The outcomes of all
-pairs are kept in build/ as they come: an interrupted run continues, and a run with more rounds adds to them. After a
-change of the estimator delete this file.
+Uses the fitted half of the families alone. Writes plugins/drift/doubt/coefficients.py, or with `--figure` a reliability
+diagram of the present coefficients, on both halves. The outcomes of all pairs are kept in build/ as they come: an
+interrupted run continues, and a run with more rounds adds to them. After a change of the estimator delete this file.
 """
 
 from __future__ import annotations
@@ -30,15 +29,12 @@ from afspm.plugins.drift.doubt.acceptance import MatchEvidence
 from afspm.plugins.drift.doubt.coefficients import SPREAD
 from afspm.plugins.drift.estimators import DEFAULT
 from benchmarks.drift.families import HALVES, Half
-from benchmarks.drift.surfaces import SURFACES
 from benchmarks.drift.trials import ELLIPSE_95, Outcome, Trial
 from benchmarks.drift.unseen import trials
 from benchmarks.drift.workers import done
 
 HARD = ("hard", "hard+prior")
 CELLS = ("real", *HARD, "null", "null+prior", "zoom+prior", "null-zoom+prior")
-WANDERING = ("real-wander", "hard-wander", "hard-wander+prior", "zoom-wander+prior")
-"""Cells of the doubt alone: pairs whose lines wander are no more often wrong, and the acceptance needs none of them."""
 AT_ONCE = 200  # jobs, before their outcomes are kept
 SEED = 20_000
 MORE_SEEDS = (30_000, 40_000)  # of stampers alone: how well they are known is the hardest to tell
@@ -47,13 +43,6 @@ KEPT = Path("build")
 COEFFICIENTS = Path(acceptance.__file__).with_name("coefficients.py")
 DOUBTS = ("varied", "shared", "unclear", "leverage")
 COVERED = 0.96  # of right matches, by the ellipses of 95 %: on others it will be less
-DOUBT_OF_ALL = 2.0
-"""Factor without a sign of doubt, given and not fitted: a free fit makes it 3.8 and the exponent of `varied` smaller.
-
-Then ellipses are larger without wander, and hold fewer pairs of another generator with much wander."""
-FREEDOM = 10.0
-"""Degrees of freedom of Student's t, by which errors of pairs whose lines wander are distributed given the doubt: the
-jackknife behind it has few blocks of rows. A fit with free degrees found 10."""
 DOMAIN = 0.99  # of accepted right matches are within the largest spread
 TURNS = 3  # who is accepted depends on the spread, and that is fitted to those who are
 
@@ -61,17 +50,12 @@ TURNS = 3  # who is accepted depends on the spread, and that is fitted to those 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.drift.fit", description=__doc__)
     parser.add_argument("--rounds", type=int, default=100, help="of one pair for each surface and condition")
-    parser.add_argument("--doubt", action="store_true", help="fit the doubt alone, and leave the acceptance as it is")
     parser.add_argument("--figure", type=Path, help="draw how far the probabilities are right")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     asked = parser.parse_args(arguments)
     halves: tuple[Half, ...] = HALVES[:1] if asked.figure is None else HALVES
-    # the diagram is of the acceptance alone
-    cells = WANDERING if asked.doubt else CELLS if asked.figure else (*CELLS, *WANDERING)
-    outcomes = {half: gathered(half, asked.rounds, asked.processes, cells) for half in halves}
-    if asked.doubt:
-        COEFFICIENTS.write_text(with_doubt(outcomes["fitted"]), encoding="utf-8")
-    elif asked.figure is None:
+    outcomes = {half: gathered(half, asked.rounds, asked.processes, CELLS) for half in halves}
+    if asked.figure is None:
         COEFFICIENTS.write_text(fitted(outcomes["fitted"]), encoding="utf-8")
     else:
         drawn(outcomes, asked.figure)
@@ -103,7 +87,7 @@ def _round(half: Half, number: int, cells: Sequence[str]) -> list[Trial]:
     more = trials(half, {cell: [seed + number for seed in MORE_SEEDS] for cell in hard}, (DEFAULT,))
     plain = trials(half, {cell: [SEED + number] for cell in cells}, (DEFAULT,))
     return [
-        *(job for job in plain if job.surface in SURFACES or job.cell not in WANDERING),  # an image has its own wander
+        *plain,
         *(job for job in more if job.surface == "stamper"),
     ]
 
@@ -137,8 +121,6 @@ def fitted(outcomes: Sequence[Outcome]) -> str:
 
     The regression uses features of unit variance.
     """
-    doubt = _doubt(outcomes)
-    outcomes = [one for one in outcomes if one.cell not in WANDERING]
     found = [(one, each) for one in outcomes if (each := evidence(one)) is not None]
     wrong = np.array([one.failed for one, _ in found], dtype=np.float64)
     accepted = np.array([one.accepted for one, _ in found])
@@ -170,40 +152,7 @@ def fitted(outcomes: Sequence[Outcome]) -> str:
         *_table("SPREAD", list(spread), list(spread.values())),
         '"""Ratio of true covariances to those of the model, in the evidence for a match, see `Doubt`."""',
         "",
-        *_doubt_table(doubt),
     ])  # fmt: skip
-
-
-def with_doubt(outcomes: Sequence[Outcome]) -> str:
-    """Return the module of coefficients with a new doubt."""
-    rest, found, _ = COEFFICIENTS.read_text(encoding="utf-8").partition("DOUBT = {")
-    assert found
-    return rest + "\n".join(_doubt_table(_doubt(outcomes)))
-
-
-def _doubt_table(doubt: Mapping[str, float]) -> list[str]:
-    table = _table("DOUBT", list(doubt), list(doubt.values()))
-    return [*table, '"""Ratio of true covariances to those of the model, see `Doubt`."""', ""]
-
-
-def _doubt(outcomes: Sequence[Outcome]) -> dict[str, float]:
-    # Most likely covariance under Student's t. Fitted to a quantile instead, all ellipses were as large as the tail of
-    # few hard pairs needs: of the others 98 to 100 % were within, with a chi2 of 0.3 to 0.5 per degree of freedom.
-    right = [one for one in outcomes if one.cell in WANDERING and one.accepted and not one.failed]
-    chi2 = np.array([one.chi2 * one.quality["spread"] for one in right])
-    columns = _doubts(right)[:, 1:]
-
-    def cost(best: Array) -> tuple[float, Array]:
-        log_spread = math.log(DOUBT_OF_ALL) + columns @ best
-        scaled = chi2 / np.exp(log_spread) / (FREEDOM - 2.0)
-        weight = (FREEDOM + 2.0) / 2.0
-        each = 1.0 - weight * scaled / (1.0 + scaled)
-        return float(np.mean(log_spread + weight * np.log1p(scaled))), each @ columns / len(right)
-
-    # a sign of doubt never makes an ellipse smaller
-    limits = [(0.0, None)] * len(DOUBTS)
-    best = minimize(cost, np.zeros(len(DOUBTS)), jac=True, method="L-BFGS-B", bounds=limits).x
-    return {"all": DOUBT_OF_ALL, **dict(zip(DOUBTS, best.tolist(), strict=True))}
 
 
 def _doubts(outcomes: Sequence[Outcome]) -> Array:

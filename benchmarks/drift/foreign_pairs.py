@@ -345,7 +345,8 @@ class ForeignPair:
     """Two scans and their truth.
 
     Attributes:
-        displacement_px: true displacement of a feature at `center_px` of the reference, in tip coordinates.
+        displacement_px: true displacement of a feature at `center_px` of the reference, in tip coordinates, with the
+            mean wander of the lines over the overlap.
         linear: change of the displacement with the position.
         bound_px: root of the trace of the Cramér-Rao bound; NaN for unrelated scans.
         elsewhere: whether the scans are unrelated.
@@ -382,10 +383,12 @@ def foreign_pair(cell: str, surface: str, seed: int) -> ForeignPair:
     if how.zoom_px:
         second = _onto_something(samples[0], second, first.width_px, random)
         clear[1] = second.sample(second.positions(how.creep_px, how.creep_length_px))
+    wanders = [np.zeros((2, frame.pixels, 1)) for frame in (first, second)]
     if how.wander_px or how.slow_creep_px:
+        wanders = [wander(frame, how, random) for frame in (first, second)]
         clear = [
-            frame.sample(frame.positions(how.creep_px, how.creep_length_px) + wander(frame, how, random))
-            for frame in (first, second)
+            frame.sample(frame.positions(how.creep_px, how.creep_length_px) + moved)
+            for frame, moved in zip((first, second), wanders, strict=True)
         ]
     heights = [samples[0].at(clear[0]), samples[-1].at(clear[1])]
     level, unit = heights[0].mean(), heights[0].std()
@@ -404,6 +407,13 @@ def foreign_pair(cell: str, surface: str, seed: int) -> ForeignPair:
     shown = second.holds(second.tip(first.sample(p)))
     center = np.array([p[0][shown].mean(), p[1][shown].mean()])
     displacement = second.tip(first.sample(center)) - center
+    if any(each.any() for each in wanders):
+        q = second.positions(0.0, 1.0)
+        back = first.holds(first.tip(second.sample(q)))
+        means = [
+            np.broadcast_to(w, q.shape)[:, there].mean(axis=1) for w, there in zip(wanders, (shown, back), strict=True)
+        ]
+        displacement = displacement + means[0] - means[1]
     linear = np.linalg.solve(second.matrix, first.matrix) - np.eye(2)
     prior = None
     if how.prior_px is not None:
@@ -419,10 +429,7 @@ def foreign_pair(cell: str, surface: str, seed: int) -> ForeignPair:
 
 
 def wander(frame: Frame, how: Circumstances, random: Random) -> Array:
-    """Return the displacement (2, y, 1) of each line: waves or 1/f noise, and slow creep at the first lines.
-
-    Its mean over the lines belongs to the error of a pair.
-    """
+    """Return the displacement (2, y, 1) of each line: waves or 1/f noise, and slow creep at the first lines."""
     rows = np.arange(frame.pixels, dtype=np.float64)
     made = _waves(rows, how.wander_rows, random) if random.random() < 0.5 else _one_over_f(frame.pixels, random)
     crept = how.slow_creep_px * random.choice((-1.0, 1.0)) * np.exp(-rows / how.slow_creep_rows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -57,12 +58,11 @@ class Frame:
         moved: Array = middle + np.einsum("ij,j...->i...", self.matrix, q_px + self._crept_px(q_px))
         return moved
 
-    def imaged_px(self, how: Condition, random: np.random.Generator) -> Array:
-        """Return the places in the sample of all pixels, shape (2, ny, nx), with the wander of the lines."""
-        q = self.offsets_px()
+    def wandered_px(self, how: Condition, random: np.random.Generator) -> Array:
+        """Return the displacement of each line by its wander, shape (2, ny)."""
         if how.wander_px or any(how.slow_creep_px):
-            q += wandered(self.shape[0], how, random)[:, :, None]
-        return self.sample_px(q)
+            return wandered(self.shape[0], how, random)
+        return np.zeros((2, self.shape[0]))
 
     def seen_px(self, sample_px: Array) -> Array:
         """Return the offset (2,) at which a place (2,) of the sample appears."""
@@ -196,21 +196,25 @@ def pair(
     first, second = samplings or (Sampling((size, size), (1.0, how.aspect)),) * 2
     frames = framed(first, second, how, random)
     views = _views(relief, frames, how, [*numbers[:2], *([] if half is None else [HALVES.index(half)])], random)
+    wanders = [f.wandered_px(how, random) for f in frames]
     scale = 1.0 / float(views[0].at(frames[0].sample_px(frames[0].offsets_px())).std())
     gain = math.exp(random.uniform(-1.0, 1.0) * math.log(how.gain))
     centers_m = [random.uniform(-20.0, 20.0, 2) * PIXEL_M for _ in frames]
     scans = [
         DriftScan(
-            values=HEIGHT_M * measured(scale * view.at(f.imaged_px(how, random)), how, random, k_gain),
+            values=HEIGHT_M
+            * measured(scale * view.at(f.sample_px(f.offsets_px() + w[:, :, None])), how, random, k_gain),
             region=Region(tuple(center_m), tuple(f.width_px * PIXEL_M)),
             start_s=k * 900.0,
             end_s=k * 900.0 + ROW_S * f.shape[0],
             upwards=not (k and how.turned_round),
             key=f"{surface}-{condition}-{seed}-{k}",
         )
-        for k, (f, view, center_m, k_gain) in enumerate(zip(frames, views, centers_m, (1.0, gain), strict=True))
+        for k, (f, view, center_m, k_gain, w) in enumerate(
+            zip(frames, views, centers_m, (1.0, gain), wanders, strict=True)
+        )
     ]
-    truth = truth_of(frames, centers_m)
+    truth = truth_of(frames, centers_m, wanders)
     known = None if prior_sd_px is None else prior_of(truth, prior_sd_px, how, first.shape[0], random)
     unit_view = replace(views[0], coefficients=scale * views[0].coefficients)
     return Pair(surface, how, scans[0], scans[1], None if how.elsewhere else truth, known, frames, unit_view, gain)
@@ -271,7 +275,8 @@ def _apart(far_px: float, random: np.random.Generator) -> tuple[float, float] | 
     return far_px * math.cos(direction), far_px * math.sin(direction)
 
 
-def truth_of(frames: tuple[Frame, Frame], centers_m: list[Array]) -> Truth:
+def truth_of(frames: tuple[Frame, Frame], centers_m: list[Array], wanders_px: Sequence[Array] = ()) -> Truth:
+    """Return the truth of a pair: the mean displacement over the rows of the overlap, with the wander of its lines."""
     first, second = frames
     back = np.linalg.inv(second.matrix)
     middle = first.seen_px(np.zeros(2))  # of the overlap, which is the origin of the sample
@@ -279,12 +284,24 @@ def truth_of(frames: tuple[Frame, Frame], centers_m: list[Array]) -> Truth:
     low = np.maximum(-first.width_px / 2, -second.width_px / 2 - (there - middle))
     high = np.minimum(first.width_px / 2, second.width_px / 2 - (there - middle))
     area = np.prod(np.maximum(high - low, 0.0)) / min(np.prod(first.width_px), np.prod(second.width_px))
+    shown = low[1], high[1]
+    moved = [  # a line displaced by w shows at q a feature of q + w
+        _mean_between(one, frame, shown[0] + way, shown[1] + way)
+        for one, frame, way in zip(wanders_px, frames, (0.0, (there - middle)[1]), strict=bool(wanders_px))
+    ]
+    wander = moved[0] - moved[1] if moved else np.zeros(2)
     return Truth(
-        displacement_m=centers_m[1] - centers_m[0] + (there - middle) * PIXEL_M,
+        displacement_m=centers_m[1] - centers_m[0] + (there - middle + wander) * PIXEL_M,
         linear=back @ first.matrix - np.eye(2),
         center_m=centers_m[0] + middle * PIXEL_M,
         overlap=float(area),
     )
+
+
+def _mean_between(wander_px: Array, frame: Frame, low_px: float, high_px: float) -> Array:
+    # of the lines between two positions along the slow axis
+    y = (np.arange(frame.shape[0]) - (frame.shape[0] - 1) / 2) * frame.step_px[1]
+    return np.asarray(wander_px[:, (y >= low_px - 0.5) & (y <= high_px + 0.5)].mean(axis=1))
 
 
 def prior_of(truth: Truth, sd_px: float, how: Condition, rows: int, random: np.random.Generator) -> Prior:

@@ -1,12 +1,18 @@
-"""The doubt of registrations of real scans: channels that are recorded together agree within their ellipses."""
+"""The doubt of registrations of real scans, tested from both sides.
+
+Channels that are recorded together, and frames in a ring, agree within their ellipses, but share the wander of their
+lines. Odd and even bands of rows do not share it: their ellipses are neither too small nor too wide for what differs.
+"""
 
 from __future__ import annotations
 
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
+import pytest
 from benchmarks.data_folder import DATA
 
+from afspm.components import Array
 from afspm.model import Region
 from afspm.plugins.drift.estimators.least_squares import LeastSquares
 from afspm.plugins.drift.registration import DriftScan, Registration
@@ -20,6 +26,8 @@ PAIRS = (
     ("nanonis/Si_7x7_028.sxm", "nanonis/Si_7x7_032.sxm"),
 )
 MOVIE = "movies/pyfastspm_test_multi_frame.npy"  # of a fast STM; bands of 8 rows wander by 0.2 px
+HIGH_SPEED = "movies/playnano_asd_sample_0.npz"  # of an AFM; bands of 8 rows wander by 0.45 px
+BAND = 16  # rows
 
 
 def _scans(name: str, at_s: float) -> dict[str, DriftScan]:
@@ -69,3 +77,28 @@ def test_registrations_of_a_movie_close_within_their_doubt() -> None:
             chi2.append(float(missed @ np.linalg.solve(covariance, missed)))
     assert len(chi2) >= 3
     assert np.mean(chi2) / 2 < 1.0
+
+
+def _between_halves(frames: Array) -> Array:
+    """Return differences between displacements by the odd and by the even bands of rows, over their deviations."""
+    found = []
+    rows = len(frames[0]) // (2 * BAND) * 2 * BAND
+    odd = (np.arange(rows) // BAND % 2 == 1)[:, None]
+    for first, second in pairwise(frames[:, :rows]):
+        region = Region((0.0, 0.0), (1e-6, 1e-6))
+        scan = DriftScan(second, region, 1.0, 2.0)
+        halves = [DriftScan(np.where(odd == which, first, np.nan), region, 0.0, 1.0) for which in (False, True)]
+        one, other = (_registered(half, scan) for half in halves)
+        if one.accepted and other.accepted:
+            moved = other.displacement_m + other.linear @ (one.center_m - other.center_m)
+            apart = one.displacement_m - moved
+            found.append(apart / np.sqrt(np.diag(one.covariance_m2 + other.covariance_m2)))
+    return np.array(found)
+
+
+@pytest.mark.parametrize(("name", "frames"), [(MOVIE, 10), (HIGH_SPEED, 12)])
+def test_halves_of_real_frames_differ_by_their_doubt(name: str, frames: int) -> None:
+    loaded = np.load(DATA / name)
+    off = _between_halves((loaded["frames"] if name == HIGH_SPEED else loaded)[:frames].astype(float))
+    assert len(off) >= 5
+    assert 0.3 < np.sqrt(np.mean(off**2)) < 1.5

@@ -12,6 +12,8 @@ from benchmarks.drift.foreign_pairs import CELLS, HEIGHT_M, SURFACES, circumstan
 from benchmarks.drift.independent import ForeignTrial
 from scipy import ndimage
 
+from afspm.plugins.drift.estimators.least_squares import LeastSquares
+
 QUIET: dict[str, Any] = {
     "white": 1e-6, "relaxing": (0.0, 0.0, 0.0), "hum": (0.0, 10.0), "offset": 0.0, "scars": 0.0, "spikes": 0.0,
     "lost": 0.0, "bow": 0.0, "step": 0.0, "flattening": "none", "creep_px": 0.0, "gain": 0.0, "bend": 0.0,
@@ -40,6 +42,18 @@ def test_without_noise_the_truth_takes_one_scan_to_the_other(
     difference = (seen - made.reference.values)[np.isfinite(seen)]
     assert difference.size > 150
     assert difference.std() < 0.06 * HEIGHT_M  # an atom of 5 px is read from its pixels to that
+
+
+def test_mean_wander_of_a_frame_counts_as_displacement(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As for a tracker: the picture of the second frame lies where its lines were on average."""
+    plain = foreign_pair("wander0.05", "rough", seed=5)
+    moved = iter((0.0, 0.7))
+    monkeypatch.setattr(foreign_pairs, "wander", lambda frame, *_: np.full((2, frame.pixels, 1), next(moved)))
+    made = foreign_pair("wander0.05", "rough", seed=5)
+    found = LeastSquares().register(made.reference, made.scan)
+    off_px = (found.displacement_m - made.displacement_m(found.center_m)) / foreign_pairs.PIXEL_M
+    assert np.hypot(*off_px) < 0.05
+    assert np.hypot(*(made.displacement_px - plain.displacement_px)) > 0.5
 
 
 def test_pairs_of_one_seed_are_the_same_and_of_another_are_not() -> None:

@@ -39,12 +39,3 @@ SPREAD = {
     "most": 39.4562,
 }
 """Ratio of true covariances to those of the model, in the evidence for a match, see `Doubt`."""
-
-DOUBT = {
-    "all": 2.0000,
-    "varied": 1.2673,
-    "shared": 0.0000,
-    "unclear": 0.0000,
-    "leverage": 0.6419,
-}
-"""Ratio of true covariances to those of the model, see `Doubt`."""

@@ -1,19 +1,27 @@
-"""Covariance of an alignment, enlarged by the signs that it is less certain than its noise model claims."""
+"""Covariance of an alignment: its noise model, and the scatter of its result without some blocks of rows.
+
+The covariance of a shift is of the mean displacement of the sample under the tip over the rows of the overlap, during
+these two frames: not of the sample between two times. Lines wander (vibration, hysteresis, creep, thermal motion), and
+their mean over a frame moves the whole picture as drift does. No pair of scans can tell one from the other, so the mean
+counts as displacement, and a tracker adds what its models of motion say of it. The error is how differently the shift
+weighs the rows. So the covariance does not depend on the spectrum of the wander, below or above a frame.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from afspm.components import Array
-from afspm.plugins.drift.doubt.coefficients import DOUBT, SPREAD
+from afspm.plugins.drift.doubt.coefficients import SPREAD
 from afspm.plugins.drift.pairs.images import Unusable
+from afspm.plugins.drift.pairs.warp import LINEAR
 from afspm.plugins.drift.registration.alignment import Believed, Fit
 
-FLOOR_PX = 1e-3
+FLOOR_PX = 2e-3
+"""Least standard deviation: errors of interpolation and of the shape of noise, which no scatter of blocks shows."""
 CLEAR_PX = 0.02  # a shift known better than this is as certain as its model says
 EVEN = 0.2  # usual share of the information in one block of rows
 LAGS = 2
@@ -21,6 +29,15 @@ LAGS = 2
 
 With blocks of 16 rows as independent ones, pairs whose lines wander by 0.2 px over 16 rows had three times the variance
 that was given."""
+OF_MODEL, OF_BLOCKS, BY_LEVERAGE = 3.0, 1.2, 0.8
+"""Factors on both parts of a shift's covariance, and exponent of `leverage`: chosen on pairs of three programs.
+
+The likelihood of the errors is largest with 0.3 to 0.5 for `OF_BLOCKS`, but then ellipses of 95 % hold 36 to 80 % of
+the pairs of another program whose lines wander in one axis, or relax. If the mean wander of a frame counted as an
+error, no factor would fit: with 4, chi² per degree of freedom is 1.8 for waves of a few rows, and 15 for a random walk
+that is slower than a frame."""
+OF_BLOCKS_LINEAR = 4.0
+"""The same of the linear part: a trend of the wander over a frame is no steady drift of the sample."""
 
 
 @dataclass(frozen=True)
@@ -28,20 +45,22 @@ class Doubt:
     """Signs that a shift is less certain than its noise model claims.
 
     Attributes:
-        varied: variance of the shift when blocks of the image are left out in turn, over the model's variance, with the
-            covariance of neighbouring blocks.
+        varied: trace of `blocks` over the model's covariance, per direction.
         shared: standard deviation of the shift, over its value if the rest of theta were known: unmodelled shear, creep
             and contrast act on the shift as well.
         sd_px: largest standard deviation by the model: the weaker the features, the more disturbances count.
         leverage: largest share, in any direction, of the information about the shift in one block of rows (MacKinnon,
             Nielsen and Webb, J. Econometrics 235, 2001, 2023). A disturbance of these rows does not average out, and
             remains unnoticed.
+        blocks: (COUNT, COUNT) covariance of theta when blocks of rows are left out in turn, with the covariance of
+            neighbouring blocks. In a direction in which lines do not wander it is as small as the model's.
     """
 
     varied: float
     shared: float
     sd_px: float
     leverage: float
+    blocks: Array
 
     def features(self) -> dict[str, float]:
         """Return the signs as logarithms, which are 0 without doubt."""
@@ -53,35 +72,37 @@ class Doubt:
         }
 
     @property
-    def spread(self) -> float:
-        """Factor on the model's covariance, fitted to pairs with and without lines that wander.
-
-        The factor has no upper limit: where lines wander by a pixel, the variance is a thousand times the model's.
-        """
-        return self._factor(DOUBT)
-
-    @property
     def spread_of_evidence(self) -> float:
         """Factor on the model's covariance in the evidence for a match, fitted to pairs without wander.
 
         Lines that wander make a match uncertain by a part of a pixel, but no more likely to be wrong. The factor is
         limited to the range of the fit.
         """
-        return min(self._factor(SPREAD), SPREAD["most"])
+        doubts = sum(SPREAD[name] * value for name, value in self.features().items())
+        return min(SPREAD["all"] * math.exp(doubts), SPREAD["most"])
 
-    def _factor(self, table: Mapping[str, float]) -> float:
-        return table["all"] * math.exp(sum(table[name] * value for name, value in self.features().items()))
+    def shift(self, model: Array) -> Array:
+        """Return the covariance (2, 2) of the shift, given the model's covariance of theta."""
+        return self._total(model, OF_BLOCKS)[:2, :2] + FLOOR_PX**2 * np.eye(2)
+
+    def linear(self, model: Array) -> Array:
+        """Return the covariance (4, 4) of the linear part, given the model's covariance of theta."""
+        return self._total(model, OF_BLOCKS_LINEAR)[LINEAR, LINEAR]
+
+    def _total(self, model: Array, of_blocks: float) -> Array:
+        factor = max(self.leverage / EVEN, 1.0) ** BY_LEVERAGE
+        total: Array = factor * (OF_MODEL * model + of_blocks * self.blocks)
+        return total
 
 
 def covariance(fit: Fit, believed: Believed) -> tuple[Array, Doubt]:
-    """Return the covariance (COUNT, COUNT) of theta, enlarged by `Doubt.spread`, and the doubt.
+    """Return the covariance (COUNT, COUNT) of theta by the model, and the doubt.
 
     The covariance by the model is (M + P)^-1 (H'QH + P) (M + P)^-T with the curvature M = H'QJ and the precision P of
     the prior (White, Econometrica 50, 1, 1982).
 
-    The variance of the shift with blocks left out is the cluster jackknife (CV3; MacKinnon, Nielsen and Webb,
+    The covariance with blocks left out is the cluster jackknife (CV3; MacKinnon, Nielsen and Webb,
     J. Appl. Econom. 38, 671, 2023), which allows for noise that is correlated within a block, and within `LAGS` blocks.
-    A few blocks hold most of the features, so this variance scatters widely and is only one of the signs.
 
     Raises:
         Unusable: theta is not finite.
@@ -95,15 +116,16 @@ def covariance(fit: Fit, believed: Believed) -> tuple[Array, Doubt]:
     change = np.linalg.solve(whole - fit.curvature[used], fit.slope[used][:, :, None])[:, :, 0]
     n = max(len(change), 1)
     varied = _long_run(change) * (n - 1) / n + inverse @ believed.precision @ inverse.T
-    model = (model + model.T) / 2
+    model, varied = (model + model.T) / 2, (varied + varied.T) / 2
     shift, alone = model[:2, :2], whole[:2, :2]
     doubt = Doubt(
         varied=float(np.trace(np.linalg.solve(shift, varied[:2, :2]))) / 2,
         shared=abs(float(np.linalg.det(shift) * np.linalg.det(alone))) ** 0.25,
         sd_px=math.sqrt(float(np.linalg.eigvalsh(shift)[-1])),
         leverage=float(np.linalg.eigvals(np.linalg.solve(alone, fit.curvature[:, :2, :2])).real.max()),
+        blocks=varied,
     )
-    return enlarged(model, doubt.spread), doubt
+    return model, doubt
 
 
 def _long_run(change: Array) -> Array:
@@ -113,10 +135,3 @@ def _long_run(change: Array) -> Array:
         across = change[lag:].T @ change[:-lag]
         total += (1.0 - lag / (LAGS + 1)) * (across + across.T)
     return np.asarray(total)
-
-
-def enlarged(model: Array, factor: float) -> Array:
-    """Return a covariance of theta, or of its shift, times a factor; the shift is known to `FLOOR_PX` at best."""
-    total: Array = factor * model
-    total[:2, :2] += FLOOR_PX**2 * np.eye(2)
-    return total

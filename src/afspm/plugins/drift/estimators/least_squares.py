@@ -16,7 +16,7 @@ import numpy as np
 from afspm.basics import ConfigError
 from afspm.components import Array
 from afspm.plugins.drift.doubt.acceptance import WRONG_AT_MOST, MatchEvidence, above_repeats, agreement
-from afspm.plugins.drift.doubt.covariance import Doubt, covariance, enlarged
+from afspm.plugins.drift.doubt.covariance import Doubt, covariance
 from afspm.plugins.drift.doubt.nuisances import CREEP_SD_PX, Shear, averaged
 from afspm.plugins.drift.pairs.images import CommonGrid, Unusable, onto_common_grid, prepare
 from afspm.plugins.drift.pairs.noise import CrossingLines, FineFilter, without_lines
@@ -92,9 +92,12 @@ class LeastSquares:
             return Registration.refused(f"the overlap of {columns} x {rows} pixels is {reason}")
         if not (np.isfinite(model).all() and np.hypot(*(theta - start[0])[:2]) < FARTHEST_PX):
             return Registration.refused("no displacement fits: the scans have no features in common")
-        found = _evidence(scene, box, theta, enlarged(model, doubt.spread_of_evidence), start[1:], expected)
-        registration = self._registration(theta, enlarged(model, doubt.spread), box, grid, found)
-        spreads = {"spread": doubt.spread, "spread_of_evidence": doubt.spread_of_evidence}
+        by_model = model[:2, :2]
+        found = _evidence(scene, box, theta, doubt.spread_of_evidence * by_model, start[1:], expected)
+        shift = doubt.shift(model)
+        registration = self._registration(theta, shift, box, grid, found)
+        wider = math.sqrt(float(np.linalg.det(shift) / np.linalg.det(by_model)))
+        spreads = {"spread": wider, "spread_of_evidence": doubt.spread_of_evidence}
         quality = {**registration.quality, **doubt.features(), **spreads}
         return replace(registration, linear_seen=_in_m(seen, grid), quality=quality)
 
@@ -107,7 +110,7 @@ class LeastSquares:
             accepted=not reason,
             reason=reason,
             displacement_m=grid.displacement_m(theta[:2]),
-            covariance_m2=grid.to_m @ total[:2, :2] @ grid.to_m.T,
+            covariance_m2=grid.to_m @ total @ grid.to_m.T,
             linear=grid.linear_m(_from_reference(theta[LINEAR].reshape(2, 2))),
             center_m=grid.position_m(box.center - theta[:2] / 2),
             quality={**asdict(found), "wrong": found.wrong},
@@ -145,8 +148,8 @@ def _fine(
     pair = WarpedPair(*scene.splines(values), inner, theta[:2], lines.own_px, lines.crossing(inner, theta[:2]))
     believed = _believed(expected or ExpectedShift(theta[:2], FARTHEST_PX**2 * np.eye(2)))
     fit = generalised_least_squares(pair, theta, believed, fine)
-    spread, doubt = covariance(fit, believed)
-    seen = LinearSeen(fit.theta[LINEAR].reshape(2, 2), spread[LINEAR, LINEAR])
+    model, doubt = covariance(fit, believed)
+    seen = LinearSeen(fit.theta[LINEAR].reshape(2, 2), doubt.linear(model))
     information, pull = (each / DISTRUST for each in fit.information(believed))
     free = believed.precision.copy()
     free[2:SLOPES] = 0.0
@@ -216,11 +219,11 @@ def _evidence(
     elsewhere = MaskedCorrelation(known, known, ELSEWHERE_PX)
     return MatchEvidence(
         overlap=float(known.sum() / scene.least_known),
-        sd_px=float(np.sqrt(np.linalg.eigvalsh(total[:2, :2])[-1])),
+        sd_px=float(np.sqrt(np.linalg.eigvalsh(total)[-1])),
         gap=likelihoods[0] - likelihoods[1],
         rival=likelihoods[1] / max(likelihoods[0], 1e-300),
         agreement=agreement(one, two, known),
         above_repeats=above_repeats(elsewhere.of(one, two), elsewhere.overlap, elsewhere.origin),
-        surprise=0.0 if expected is None else expected.surprise(theta[:2], total[:2, :2]),
+        surprise=0.0 if expected is None else expected.surprise(theta[:2], total),
         searched=1.0 if expected is None else min(expected.area_px2 / scene.least_known, 1.0),
     )

@@ -57,7 +57,9 @@ class Registration:
         accepted: whether the result may be used; if not, displacement and covariance are the best guess, or NaN.
         reason: reason for a refusal, for people; empty if accepted.
         displacement_m: (2,) displacement at `center_m`.
-        covariance_m2: (2, 2) covariance of the displacement.
+        covariance_m2: (2, 2) covariance of the displacement as the mean over the rows of the overlap during these two
+            frames, not of the sample between two times: the mean wander of the lines over a frame counts as
+            displacement. `track` adds the motion between the frames.
         linear: (2, 2) rotation, scale and shear; zero for a pure translation.
         center_m: (2,) centre of the overlap, where the displacement holds, in tip coordinates of the reference.
         quality: figures of merit by name (overlap, correlation, …), for people and for studies.
