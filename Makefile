@@ -223,9 +223,9 @@ bench-compare: $(TEST)
 	@$(BIN)/python -m benchmarks.compare $(BEFORE) --after $(AFTER) $(NAMES)
 
 ## drift: errors of the estimates beside the theoretical bound, and build/bench-drift.json, in half an hour.
-## EIGHTH=1 runs an eighth of the pairs, in four minutes, and judges no target
+## EIGHTH=1 runs an eighth of the pairs, in four minutes, and judges the targets that allow no pair. LAND=1 lands this run
 bench-drift: $(TEST)
-	@$(BIN)/python -m benchmarks.drift $(if $(EIGHTH),--quick)
+	@$(BIN)/python -m benchmarks.drift $(if $(EIGHTH),--quick) $(if $(LAND),--land)
 
 ## line watch, learning repair and adaptive maps, on surfaces, answers and maps that no setting was tried on: hours.
 ## The last one misses its target, hum without retrace, and so ends with an error

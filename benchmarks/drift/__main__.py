@@ -1,8 +1,11 @@
 """`python -m benchmarks.drift`: accuracy of drift estimation, beside the bound and the methods of features.
 
 Prints tables, writes build/bench-drift.json (the lines with a target, in the form of build/bench.json) and
-build/bench-drift.txt (all printed text). Returns 1 if a target was missed; with `--quick` it judges none, and shows
-only that the benchmark works.
+build/bench-drift.txt (all printed text). Returns 1 if a target was missed; with `--quick` it judges the targets that
+allow no pair at all, since an eighth of the pairs proves a miss of these alone.
+
+Beside each line stands its value in the last landed run of all pairs (benchmarks/drift/landed.json), which `--land`
+replaces: so a change shows its cost, also where the target is missed as before.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ import os
 import secrets
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 # Before numpy starts its own threads: the cores are shared out by pairs.
@@ -35,11 +38,16 @@ from benchmarks.rows import Row
 PARTS = ("tracks", "sizes", "accuracy", "unseen", "independent")  # the longest jobs first
 ON_REQUEST = ("inliers",)  # of the paper's method, without a target
 RESULT = Path("build/bench-drift.json")
+LANDED = Path(__file__).with_name("landed.json")
 NAMES = entry_points.names(entry_points.ESTIMATORS)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    asked = _parser().parse_args(arguments)
+    parser = _parser()
+    asked = parser.parse_args(arguments)
+    if asked.land and asked.quick:
+        parser.error("an eighth of the pairs can't be landed")
+    before = json.loads(LANDED.read_text(encoding="utf-8")) if LANDED.exists() else {}
     console = Console(record=True, width=140, highlight=False)
     plan = Plan(asked.seed, asked.quick, _available(asked.estimators, console))
     began_s = time.perf_counter()
@@ -54,19 +62,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
             console.print(table, "")
     if "sizes" in asked.parts:
         rows += sizes.costs(plan)
-    console.print(_targets(rows))
+    judged = [row for row in rows if not plan.quick or row.target == 0.0]
+    console.print(_targets(rows, judged, before))
     console.print(f"seed {plan.seed}{', an eighth of the pairs' * plan.quick}; {time.perf_counter() - began_s:.0f} s")
     RESULT.parent.mkdir(exist_ok=True)
     RESULT.write_text(json.dumps([row.to_json() for row in rows], indent=1) + "\n", encoding="utf-8")
     RESULT.with_suffix(".txt").write_text(console.export_text(), encoding="utf-8")
-    # so few pairs judge no target: a share of six pairs has steps of 17 %
-    return 0 if plan.quick or all(row.met for row in rows) else 1
+    if asked.land:
+        found = {**before, **{row.name: float(f"{row.ratio:.4g}") for row in rows}}
+        LANDED.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    return 0 if all(row.met for row in judged) else 1
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.drift", description=__doc__)
     parser.add_argument("--seed", type=int, default=secrets.randbelow(10**6) * 1000, help="default: a fresh one")
-    parser.add_argument("--quick", action="store_true", help="an eighth of the pairs, without a verdict")
+    parser.add_argument("--quick", action="store_true", help="an eighth of the pairs, for targets of no pair")
+    parser.add_argument("--land", action="store_true", help="keep the values, to compare later runs with")
     parser.add_argument("--parts", nargs="+", choices=(*PARTS, *ON_REQUEST), default=list(PARTS))
     parser.add_argument("--estimators", nargs="+", default=[DEFAULT, *(n for n in NAMES if n != DEFAULT)],
                         help="names; the first is held against the targets")  # fmt: skip
@@ -88,16 +100,18 @@ def _available(names: Sequence[str], console: Console) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _targets(rows: Sequence[Row]) -> Table:
+def _targets(rows: Sequence[Row], judged: Sequence[Row], before: Mapping[str, float]) -> Table:
     table = Table(title="targets", title_justify="left", box=None, pad_edge=False)
-    for head in ("", "ours", "beside", "ratio", "target", ""):
+    for head in ("", "ours", "beside", "ratio", "landed", "target", ""):
         table.add_column(head, justify="left" if not head else "right")
     for row in rows:
         sign = "<=" if row.better == "low" else ">="
         bare = "" if row.bare is None else f"{row.bare:.4g}"
-        mark = "[green]met[/]" if row.met else "[red]MISSED[/]"
+        mark = "" if row not in judged else "[green]met[/]" if row.met else "[red]MISSED[/]"
         ratio = "" if row.bare is None else f"{row.ratio:.2f}"
-        table.add_row(f"{row.name} \\[{row.unit}]", f"{row.ours:.4g}", bare, ratio, f"{sign} {row.target:g}", mark)
+        landed = f"{before[row.name]:.4g}" if row.name in before else ""
+        name = f"{row.name} \\[{row.unit}]"
+        table.add_row(name, f"{row.ours:.4g}", bare, ratio, landed, f"{sign} {row.target:g}", mark)
     return table
 
 

@@ -44,6 +44,13 @@ def test_a_refusal_names_the_strongest_objection_and_the_probability_of_a_wrong_
     assert f"wrong with a probability of {repeated.wrong:.0%}" in repeated.refusal(0.1)
 
 
+def test_a_likely_rival_is_refused_unless_the_displacement_is_expected() -> None:
+    repeated = replace(GOOD, rival=0.8)
+    assert repeated.wrong < 0.05
+    assert "another displacement explains 80%" in repeated.refusal(0.05)
+    assert replace(repeated, searched=0.01).refusal(0.05) == ""
+
+
 def test_the_fit_gives_calibrated_probabilities() -> None:
     """Matches that are right or wrong depending only on the agreement of their parts."""
     random = np.random.default_rng(2)

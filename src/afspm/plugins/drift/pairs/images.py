@@ -13,7 +13,8 @@ from afspm.plugins.drift.pairs.drift_scan import DriftScan
 
 Mask = NDArray[np.bool_]
 
-LEAST_ROWS = 0.5  # least share of measured rows in a scan
+LEAST_ROWS = 0.08  # least share of measured rows in a scan: a stopped scan with a tenth of its rows has features
+LEAST_OF_ROW = 0.3  # least share of measured pixels in such a row
 LEAST_TOPOGRAPHY = 0.1  # correlation of neighbouring rows; noise and streaks have none
 MOST_SATURATED = 0.6  # largest share of pixels at exactly the lowest or the highest value
 
@@ -28,8 +29,8 @@ class Image:
 
     Attributes:
         values: [y, x], finite everywhere: unmeasured pixels are filled from the nearest measured pixel.
-        known: [y, x], true for measured pixels of rows that are mostly measured, and for a single missing row between
-            measured rows.
+        known: [y, x], true for measured pixels of rows with at least `LEAST_OF_ROW` of them, and for a single missing
+            row between measured rows.
         made_up: [y, x], true for values interpolated from neighbouring rows, which carry no information about a
             displacement; None: nowhere.
     """
@@ -43,12 +44,12 @@ def prepare(values: Array) -> Image:
     """Return an image with flattened rows, clipped outliers, mended scars, and a standard deviation of 1.
 
     Raises:
-        Unusable: fewer than half of the rows are measured, or the values are constant, saturated, only an offset and a
+        Unusable: fewer than `LEAST_ROWS` are measured, or the values are constant, saturated, only an offset and a
             tilt in each row, or without topography (a crashed tip).
     """
     known = np.isfinite(values)
     known &= ~_unfinished(np.where(known, values, 0.0))[:, None]
-    rows = known.mean(axis=1) > 0.5
+    rows = known.mean(axis=1) >= LEAST_OF_ROW
     known &= rows[:, None]
     if rows.mean() < LEAST_ROWS:
         raise Unusable(f"only {rows.sum()} of {rows.size} rows hold values")
