@@ -37,7 +37,9 @@ the pairs of another program whose lines wander in one axis, or relax. If the me
 error, no factor would fit: with 4, chi² per degree of freedom is 1.8 for waves of a few rows, and 15 for a random walk
 that is slower than a frame."""
 OF_BLOCKS_LINEAR = 4.0
-"""The same of the linear part: a trend of the wander over a frame is no steady drift of the sample."""
+"""The same of the linear part: a trend of the wander over a frame is no steady drift of the sample.
+
+Squares of errors over this variance are 1.0 on average for pairs of the families with wander, and 0.3 without."""
 
 
 @dataclass(frozen=True)
