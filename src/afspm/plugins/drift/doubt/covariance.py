@@ -36,10 +36,12 @@ The likelihood of the errors is largest with 0.3 to 0.5 for `OF_BLOCKS`, but the
 the pairs of another program whose lines wander in one axis, or relax. If the mean wander of a frame counted as an
 error, no factor would fit: with 4, chi² per degree of freedom is 1.8 for waves of a few rows, and 15 for a random walk
 that is slower than a frame."""
-OF_BLOCKS_LINEAR = 4.0
-"""The same of the linear part: a trend of the wander over a frame is no steady drift of the sample.
+LINEAR_OF_MODEL, LINEAR_BY_VARIED, LINEAR_BY_LEVERAGE = 2.0, 1.27, 0.64
+"""Factor on the model's covariance of the linear part, and its exponents.
 
-Squares of errors over this variance are 1.0 on average for pairs of the families with wander, and 0.3 without."""
+A trend of the wander over a frame is no steady drift of the sample, and the whole variance of the blocks counts, which
+four times `Doubt.blocks` would give, too: but a factor of the model scatters less, and stays smaller without wander.
+Squares of errors over this variance are 1.0 on average for pairs of the families with wander, and 0.5 without."""
 
 
 @dataclass(frozen=True)
@@ -85,15 +87,14 @@ class Doubt:
 
     def shift(self, model: Array) -> Array:
         """Return the covariance (2, 2) of the shift, given the model's covariance of theta."""
-        return self._total(model, OF_BLOCKS)[:2, :2] + FLOOR_PX**2 * np.eye(2)
+        factor = max(self.leverage / EVEN, 1.0) ** BY_LEVERAGE
+        total: Array = factor * (OF_MODEL * model + OF_BLOCKS * self.blocks)[:2, :2]
+        return total + FLOOR_PX**2 * np.eye(2)
 
     def linear(self, model: Array) -> Array:
         """Return the covariance (4, 4) of the linear part, given the model's covariance of theta."""
-        return self._total(model, OF_BLOCKS_LINEAR)[LINEAR, LINEAR]
-
-    def _total(self, model: Array, of_blocks: float) -> Array:
-        factor = max(self.leverage / EVEN, 1.0) ** BY_LEVERAGE
-        total: Array = factor * (OF_MODEL * model + of_blocks * self.blocks)
+        leverage = max(self.leverage / EVEN, 1.0) ** LINEAR_BY_LEVERAGE
+        total: Array = LINEAR_OF_MODEL * max(self.varied, 1.0) ** LINEAR_BY_VARIED * leverage * model[LINEAR, LINEAR]
         return total
 
 
