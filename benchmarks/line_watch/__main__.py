@@ -22,7 +22,7 @@ from itertools import islice, repeat
 from pathlib import Path
 
 from benchmarks.line_watch.nights import HALVES, ROWS, WITHIN, NightOutcome, judged_night
-from benchmarks.line_watch.rooms import ROOM_KINDS, SAMPLE_KINDS, JudgedScan, judged_room, table
+from benchmarks.line_watch.rooms import CONTRAST_KINDS, KINDS, ROOM_KINDS, SAMPLE_KINDS, JudgedScan, judged_room, table
 
 KEPT = Path("build/line_watch.jsonl")
 KEPT_ROOMS = Path("build/line_watch_rooms.jsonl")
@@ -38,12 +38,12 @@ def main(arguments: Sequence[str]) -> int:
     asked.add_argument("--half", choices=HALVES, default="unseen")
     asked.add_argument("--processes", type=int, default=1)
     asked.add_argument("--rooms", type=int, default=0, help="judge as many rooms in place of nights")
+    asked.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS, help="of scans in the rooms")
     asked.add_argument("--without-retrace", action="store_true", help="judge the trace of the rooms alone")
     given = asked.parse_args(arguments)
     if given.rooms:
-        return judge_rooms(
-            range(given.first, given.first + given.rooms), given.processes, channels=1 if given.without_retrace else 2
-        )
+        rooms, channels = range(given.first, given.first + given.rooms), 1 if given.without_retrace else 2
+        return judge_rooms(rooms, given.processes, channels, given.kinds)
     end_s, found = time.monotonic() + 60.0 * given.minutes, []
     KEPT.parent.mkdir(exist_ok=True)
     seeds = iter(range(given.first, given.first + given.nights))
@@ -56,12 +56,12 @@ def main(arguments: Sequence[str]) -> int:
     return report(found)
 
 
-def judge_rooms(seeds: Sequence[int], processes: int, channels: int) -> int:
+def judge_rooms(seeds: Sequence[int], processes: int, channels: int, kinds: Sequence[str]) -> int:
     """Print the table of some rooms; return 1 where a target is missed."""
     found: list[JudgedScan] = []
     KEPT_ROOMS.parent.mkdir(exist_ok=True)
     with ProcessPoolExecutor(processes) as pool, KEPT_ROOMS.open("w", encoding="utf-8") as kept:
-        for outcomes in pool.map(judged_room, repeat("kept"), seeds, repeat(channels)):
+        for outcomes in pool.map(judged_room, repeat("kept"), seeds, repeat(channels), repeat(kinds)):
             found += outcomes
             kept.writelines(json.dumps(asdict(one)) + "\n" for one in outcomes)
     print(*table(found), sep="\n")
@@ -69,7 +69,7 @@ def judge_rooms(seeds: Sequence[int], processes: int, channels: int) -> int:
     tips = [one for one in found if one.is_visible]
     is_met = (
         share(stopped, found, ROOM_KINDS) <= MOST_FALSE
-        and share(stopped, found, SAMPLE_KINDS) <= MOST_CHANGED
+        and share(stopped, found, (*SAMPLE_KINDS, *CONTRAST_KINDS)) <= MOST_CHANGED
         and sum(one.is_seen for one in tips) >= LEAST_IN_ROOMS * len(tips)
     )
     return 0 if is_met else 1

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy import ndimage, spatial
+from scipy import ndimage, signal, spatial
 
 from afspm.components import Array
 from afspm.model import Region
@@ -37,8 +37,10 @@ ROOM_KINDS = (
     "nothing", "noise x 1.2", "noise x 1.5", "hum", "bump of the table", "drift", "creep", "missing rows", "zero rows",
 )  # fmt: skip
 SAMPLE_KINDS = ("an adatom appears", "a particle is dragged")
+CONTRAST_KINDS = ("overshoot", "saturation", "bent contrast", "z scale")
 TIP_KINDS = ("blunt tip", "double tip", "debris on the tip")
-KINDS = (*ROOM_KINDS, *SAMPLE_KINDS, *TIP_KINDS)
+NOISE_KINDS = ("streaks", "noise burst")
+KINDS = (*ROOM_KINDS, *SAMPLE_KINDS, *CONTRAST_KINDS, *TIP_KINDS, *NOISE_KINDS)
 
 
 def grains(place: Random, sample: Random, x: Array, y: Array) -> Array:
@@ -127,7 +129,7 @@ class Room:
         self._drift_px = speed * np.array([math.cos(turn), math.sin(turn)])  # a period
         self._images: dict[_RoomTip, Array] = {}
 
-    def judged(self, kinds: tuple[str, ...] = KINDS, *, channels: int = 2) -> list[JudgedScan]:
+    def judged(self, kinds: Sequence[str], *, channels: int) -> list[JudgedScan]:
         """Judge one scan of each kind, line by line."""
         learnt = self._taught(channels, self._drift_px)
         return [self._judged(kind, learnt, channels) for kind in kinds]
@@ -181,9 +183,16 @@ class Room:
                 is_visible = bool(np.mean(off >= noise) >= 0.25)
         else:
             is_visible = False
-        if kind.startswith("noise"):
+        if kind in CONTRAST_KINDS and kind != "saturation":
+            clean = self._contrast(kind, clean)
+        if kind.startswith("noise x"):
             noise *= float(kind.removeprefix("noise x "))
         picture = self._recorded(clean, noise)
+        if kind == "saturation":
+            end = float(np.quantile(picture[0], random.uniform(0.85, 0.97)))
+            picture = [np.minimum(values, end) for values in picture]
+        if kind in NOISE_KINDS:
+            self._disturb(kind, picture, row)
         if kind == "hum":
             self._hum(picture)
         if kind == "bump of the table":
@@ -262,6 +271,36 @@ class Room:
         picture[0] += amplitude * np.sin(math.tau * time / period)
         picture[1] += amplitude * np.sin(math.tau * (time[:, ::-1] + PIXELS) / period)
 
+    def _contrast(self, kind: str, clean: list[Array]) -> list[Array]:
+        random = self.random
+        if kind == "bent contrast":
+            size, bend = float(np.ptp(clean[0])), random.choice([-1.0, 1.0]) * random.uniform(0.1, 0.25)
+            # a parabola with an eighth of this, 1 to 3 %, in the middle of the range
+            return [values + bend / size * (values - values.min()) * (values - values.max()) / 2.0 for values in clean]
+        if kind == "z scale":
+            factor = 1.0 + random.choice([-1.0, 1.0]) * random.uniform(0.02, 0.06)
+            return [factor * values for values in clean]
+        # a feedback of second order with too much gain, behind edges of either direction
+        turn, damping = random.uniform(0.4, 1.2), random.uniform(0.2, 0.6)
+        pole = np.exp(turn * complex(-damping, math.sqrt(1.0 - damping**2)))
+        below = [1.0, -2.0 * pole.real, abs(pole) ** 2]
+        back = clean[1][:, ::-1]
+        return [_fed_back(clean[0], below), _fed_back(back, below)[:, ::-1]]
+
+    def _disturb(self, kind: str, picture: list[Array], row: int) -> None:
+        random = self.random
+        if kind == "noise burst":
+            rows, factor = int(random.integers(16, 60)), random.uniform(3.0, 8.0)
+            for values in picture:
+                part = values[row : row + rows]
+                part += math.sqrt(factor**2 - 1.0) * self._noise * random.normal(size=part.shape)
+            return
+        for values in picture:
+            for line in values[row:]:
+                for _ in range(random.poisson(0.9)):  # 60 % of the lines
+                    first, long = random.integers(-10, PIXELS - 5), random.integers(8, 60)
+                    line[max(0, first) : first + long] += random.choice([-1.0, 1.0]) * random.uniform(0.6, 2.0)
+
     def _bump(self, picture: list[Array], row: int) -> None:
         period, lasting = self.random.uniform(10.0, 80.0), self.random.uniform(0.5, 3.0) * 2.0 * PIXELS
         start = row * 2.0 * PIXELS + self.random.uniform(0.0, PIXELS)
@@ -277,6 +316,11 @@ class Room:
 
 
 _KIND = Kind.of(REGION, (PIXELS, PIXELS), "")
+
+
+def _fed_back(values: Array, below: list[float]) -> Array:
+    start = signal.lfilter_zi([sum(below)], below) * values[:, :1]
+    return np.asarray(signal.lfilter([sum(below)], below, values, axis=1, zi=start)[0])
 
 
 def _imaged(ground: Array, tip: _RoomTip) -> Array:
@@ -303,15 +347,17 @@ def table(found: Sequence[JudgedScan]) -> list[str]:
         looked = sum(one.look_row is not None for one in of)
         stopped = sum(one.stop_row is not None for one in of)
         seen = f", {sum(one.is_seen for one in of)} within {WITHIN} rows" if kind in TIP_KINDS else ""
+        if kind in NOISE_KINDS:
+            seen = f", {sum(one.is_looked_at for one in of)} looked at within {WITHIN} rows"
         noisier = float(np.median([one.noisier for one in of]))
         lines.append(f"{kind:22} {stopped:4} of {len(of)} stopped{seen}; {looked} looked at; noise x {noisier:.2f}")
     good = [one for one in found if one.kind in ROOM_KINDS]
-    changed = [one for one in found if one.kind in SAMPLE_KINDS]
+    changed = [one for one in found if one.kind in (*SAMPLE_KINDS, *CONTRAST_KINDS)]
     tips = [one for one in found if one.is_visible]
     delays = sorted(one.stop_row - one.at_row for one in tips if one.is_seen and one.stop_row is not None)
     for what, of, count in (
         ("good scans stopped", good, sum(one.stop_row is not None for one in good)),
-        ("changed samples stopped", changed, sum(one.stop_row is not None for one in changed)),
+        ("changed samples and contrasts stopped", changed, sum(one.stop_row is not None for one in changed)),
         (f"visible tip changes stopped within {WITHIN} rows", tips, len(delays)),
         (f"visible tip changes looked at within {WITHIN} rows", tips, sum(one.is_looked_at for one in tips)),
     ):
@@ -320,6 +366,6 @@ def table(found: Sequence[JudgedScan]) -> list[str]:
     return lines
 
 
-def judged_room(half: Half, seed: int, channels: int = 2) -> list[JudgedScan]:
+def judged_room(half: Half, seed: int, channels: int, kinds: Sequence[str]) -> list[JudgedScan]:
     """Return the outcomes of one room."""
-    return Room(half, seed).judged(channels=channels)
+    return Room(half, seed).judged(kinds, channels=channels)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
 import pytest
+from scipy import signal
 from tests.plugins.line_watch.line_scans_lab import (
     CHANGED_ROW,
     CHANNELS,
@@ -303,3 +305,82 @@ def test_rests_of_stopped_scans_do_not_displace_a_known_kind() -> None:
         rest = Kind.of(HOME, (rows, ROWS), "")
         judge.learn([values[:rows] for values in heights(night()[0])], HOME, rest, 500.0)
     assert judge.pairs(KIND) == LEARNT - 1
+
+
+def looks(picture: Heights, channels: int = 2) -> list[Alarm]:
+    """Return all alarms of the scan after the first ones, with or without its retrace."""
+    judge = taught() if channels == 2 else taught_without_retrace()
+    running = judge.begin(HOME, KIND, LEARNT * PERIOD_S, channels=channels)
+    assert running is not None
+    rows = (running.add(row, [values[row] for values in picture[:channels]]) for row in range(ROWS))
+    return [alarm for alarm in rows if alarm is not None]
+
+
+@pytest.mark.parametrize("channels", [1, 2])
+def test_three_times_the_noise_is_looked_at_within_twenty_rows(channels: int) -> None:
+    random = np.random.default_rng(4)
+    noisy = heights(night()[LEARNT])
+    for values in noisy:
+        values[CHANGED_ROW:] += math.sqrt(8.0) * USUAL_M * random.standard_normal(values[CHANGED_ROW:].shape)
+    (alarm,) = looks(noisy, channels)
+    assert alarm.level is AlarmLevel.LOOK
+    assert CHANGED_ROW - 2 <= alarm.since_row < alarm.row <= CHANGED_ROW + 20
+    assert "the noise is" in alarm.why
+
+
+@pytest.mark.parametrize("channels", [1, 2])
+def test_streaks_are_looked_at_within_twenty_rows(channels: int) -> None:
+    random = np.random.default_rng(5)
+    streaked = heights(night()[LEARNT])
+    for values in streaked:
+        for row in CHANGED_ROW + np.nonzero(random.random(ROWS - CHANGED_ROW) < 0.6)[0]:
+            first = int(random.integers(ROWS - 10))
+            values[row, first : first + int(random.integers(8, 20))] += 15.0 * USUAL_M
+    (alarm,) = looks(streaked, channels)
+    assert alarm.level is AlarmLevel.LOOK
+    assert CHANGED_ROW <= alarm.row <= CHANGED_ROW + 20
+    assert "streaks" in alarm.why or channels == 1, "without retrace, strong streaks look like noise"
+
+
+def overshooting(values: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> np.ndarray:
+    """Return lines as of a feedback of second order with little damping."""
+    pole = 0.75 * np.exp(0.7j)
+    below = [1.0, -2.0 * pole.real, abs(pole) ** 2]
+    start = signal.lfilter_zi([sum(below)], below) * values[:, :1]
+    return np.asarray(signal.lfilter([sum(below)], below, values, axis=1, zi=start)[0])
+
+
+@pytest.mark.parametrize("cause", ["contrast", "range", "overshoots"])
+def test_change_that_is_a_function_of_height_or_follows_edges_is_looked_at(cause: str) -> None:
+    trace, retrace = heights(night()[LEARNT])
+    if cause == "contrast":
+        trace, retrace = 1.05 * trace, 1.05 * retrace
+    elif cause == "range":
+        trace, retrace = (np.minimum(values, np.quantile(values, 0.93)) for values in (trace, retrace))
+    else:
+        trace, retrace = overshooting(trace), overshooting(retrace[:, ::-1])[:, ::-1]
+    (alarm,) = looks([trace, retrace])
+    assert alarm.level is AlarmLevel.LOOK
+    # what overshoots on few features looks like noise first: trace and retrace differ
+    assert cause in alarm.why or cause == "overshoots"
+
+
+def test_large_change_of_the_contrast_within_a_scan_is_the_tip() -> None:
+    changed = heights(night()[LEARNT])
+    for values in changed:
+        values[CHANGED_ROW:] *= 1.3
+    assert looks(changed)[-1].level is AlarmLevel.STOP
+
+
+def test_large_change_of_the_contrast_of_lamellae_is_no_overshoot() -> None:
+    random, phase = np.random.default_rng(6), np.add.outer(0.2 * np.arange(ROWS), 0.7 * np.arange(ROWS))
+    scans = [
+        {name: 2e-9 * np.sin(phase) + 1e-10 * random.standard_normal(phase.shape) for name in CHANNELS}
+        for _ in range(LEARNT + 1)
+    ]
+    changed = heights(scans[LEARNT])
+    for values in changed:
+        values[CHANGED_ROW:] *= 0.65
+    alarm = stopped(taught(scans), changed)
+    assert alarm is not None
+    assert CHANGED_ROW <= alarm.row <= CHANGED_ROW + 20

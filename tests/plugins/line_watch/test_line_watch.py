@@ -129,13 +129,26 @@ def test_adsorbate_that_stays_is_looked_at_twice_and_is_then_the_reference(caplo
 def test_more_noise_is_reported_once_a_scan(caplog: pytest.LogCaptureFixture) -> None:
     lab, random = Lab("line_watch"), np.random.default_rng(7)
     for number, picture in enumerate(night()[: LEARNT + 1]):
-        noise_m = 0.0 if number < LEARNT else 0.6e-9
+        noise_m = 0.0 if number < LEARNT else 0.4e-9
         tell(lab, number, {name: v + noise_m * random.standard_normal(v.shape) for name, v in picture.items()})
     lab.at(900.0, lab.kill)
     run(LineWatch(action="stop"), lab)
     [text] = [text for text in caplog.messages if "the noise is" in text]
     assert "times the noise of earlier scans" in text
     assert verdicts(lab) == []
+
+
+def test_strong_noise_is_looked_at_and_stops_nothing() -> None:
+    lab, random = Lab("line_watch"), np.random.default_rng(7)
+    for number, picture in enumerate(night()[: LEARNT + 1]):
+        noise_m = 0.0 if number < LEARNT else 0.9e-9
+        tell(lab, number, {name: v + noise_m * random.standard_normal(v.shape) for name, v in picture.items()})
+    lab.at(900.0, lab.kill)
+    run(LineWatch(action="stop"), lab)
+    (verdict,) = verdicts(lab)
+    assert "the noise is" in verdict.reason
+    assert not verdict.stops
+    assert not flags(lab)
 
 
 def test_reason_why_nothing_is_judged_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:

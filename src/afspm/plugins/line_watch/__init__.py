@@ -8,5 +8,6 @@ summed up; a sum above the sums of good scans raises an alarm.
     goes out      a `TipVerdict` with the row; the flag `tip-shape-changed`
     always holds  nothing is learnt from a scan with an alarm, a flagged problem, a changed feedback or a bad verdict
 
-`registration` finds the shift of single lines, `line_judge` decides; both are pure. `line_watch` is the component.
+`registration` finds the shift of single lines, and `line_judge` decides. `causes` explains differences without the tip,
+and `disturbances` finds noise and streaks. All of these are pure. `line_watch` is the component.
 """

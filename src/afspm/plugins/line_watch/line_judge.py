@@ -13,7 +13,8 @@ scans, times a factor, and at least a fixed value. A sum above the threshold rai
 threshold `LOOK`, once enough lines since the change are known. Before an alarm, a wider search for the shift shows
 whether the sample has jumped: then the template explains the lines again. A scan is stopped only for a change of the
 whole line, or for one that lasts, as a tip makes it: an adsorbate, or a particle that was dragged, changes one or two
-narrow parts of some lines.
+narrow parts of some lines. Nor is it stopped if another contrast, the end of the range of heights, or overshoot at the
+edges explains the lines (`causes`). Strong noise and streaks are looked at (`disturbances`).
 
 Without retrace, the waves of a hum may be in step in successive lines, as an image is. But a hum has one frequency, and
 a changed tip many. So before an alarm, a narrow peak in the spectrum of the differing lines is removed from these and
@@ -34,8 +35,11 @@ from numpy.typing import NDArray
 from afspm.basics import Plain
 from afspm.components import Array, from_plain, to_plain
 from afspm.model import Region
+from afspm.plugins.line_watch.causes import is_slight, of_height, without_ends, without_overshoot
+from afspm.plugins.line_watch.disturbances import Disturbances
 from afspm.plugins.line_watch.registration import (
     CLIP_SIGMAS,
+    Cause,
     RowFit,
     RowRegistration,
     RowTemplate,
@@ -88,6 +92,9 @@ class JudgeSettings:
     # number and width, relative to the line, of parts that a changed sample may fill
     parts: tuple[tuple[int, float], ...] = ((1, 1 / 4), (2, 1 / 8))
     elsewhere: float = 0.4  # share of the threshold that the rest of the lines must reach before a scan is stopped
+    # share of the sum that another cause than the tip may leave, if that is more than `elsewhere`; each of 9 changed
+    # tips left a third or more
+    left: float = 0.25
     # share of the rows for which a sum grows before the change counts as the tip's, and not as a single adsorbate's.
     # Without this rule a double tip among few particles in 64 rows never stopped a scan.
     lasting: float = 3 / 8
@@ -376,17 +383,19 @@ class _Comparer:
     jumps: int = 0  # of the sample, in this scan
     before: RowFit | None = None  # the line before, without retrace
     hums: tuple[float, ...] = ()  # frequencies per pixel, removed from lines without retrace
+    cause: Cause | None = None
 
     def follow(self, row: int, line: Sequence[Array]) -> None:
         self.registration.follow(row, line[0])
 
     def fits(self, row: int, line: Sequence[Array]) -> list[RowFit]:
         # two recordings of the image: trace and retrace, or a line and the one before; else none
-        found = [self.registration.fit(row, values, of) for of, values in zip(self.place.templates, line, strict=True)]
+        templates = self.place.templates
+        found = [self.registration.fit(row, one, of, self.cause) for of, one in zip(templates, line, strict=True)]
         if len(line) == 1:
             if self.hums and found[0] is not None:
                 # fitted again: a hum moves the shift of its line
-                found = [self.registration.fit(row, line[0] - _waves(found[0].residual, self.hums))]
+                found = [self.registration.fit(row, line[0] - _waves(found[0].residual, self.hums), cause=self.cause)]
             found.append(self.before)
             self.before = found[0]
         fits = [fit for fit in found if fit is not None]
@@ -405,6 +414,7 @@ class ScanJudge:
         self.alarm: Alarm | None = None
         self.fitted: dict[int, list[RowFit]] = {}
         self._filter = NoiseFilter(statistic.flat_m, statistic.per_slope)
+        self._disturbances = Disturbances(statistic.flat_m, statistic.per_slope, statistic.noise)
         self._comparer, self._statistic, self._what = comparer, statistic, what
         self._cusum = Cusum()
         self._sums: list[float] = []  # since the CUSUM last left zero
@@ -412,6 +422,7 @@ class ScanJudge:
         self._followed = 0
         self._hum = 0.0  # mean square of the removed hums, relative to flat_m squared
         self._recent: list[tuple[int, list[Array]]] = []
+        self._without_ends: dict[int, list[Array]] = {}
 
     @property
     def threshold(self) -> float:
@@ -443,6 +454,7 @@ class ScanJudge:
             return None  # a missing line is no evidence about the tip
         self._comparer.follow(row, level)
         self._recent = [*self._recent, (row, level)][-FITTED.remembered :]
+        self._without_ends[row] = [without_ends(values, flat) for values, flat in zip(line, level, strict=True)]
         self._followed += 1
         fits = self._comparer.fits(row, level)
         if not fits:
@@ -451,18 +463,32 @@ class ScanJudge:
         if self._followed <= FITTED.acquire:
             return None  # the scanner still creeps from its last move: the first lines only find the shift, and noise
         self.fitted[row] = fits
+        disturbed = self._disturbances.add(row, fits)
         self._sum_up(row, self._statistic.sigmas(products))
         found = self._higher_level()
         while found is not None and self._hums():
             found = self._higher_level()
-        if found is None:
+        if found is not None and self._has_jumped():
+            self._cusum, self._sums, found = Cusum(), [], None
+        if found is not None:
+            return self._raised(found, row)
+        if disturbed is None or self.alarm is not None:
             return None
-        if self._has_jumped():
-            self._cusum, self._sums = Cusum(), []
-            return None
+        since, why = disturbed
+        self.alarm = Alarm(AlarmLevel.LOOK, row, since, FITTED.look, why)
+        return self.alarm
+
+    def _raised(self, level: AlarmLevel, row: int) -> Alarm | None:
         since = row if self._cusum.since is None else self._cusum.since
         basis = f"{self.evidence:.1f} times the threshold from {self._statistic.pairs} good pairs of scans"
-        self.alarm = Alarm(found, row, since, self.evidence, f"{self._what} since row {since} ({basis})")
+        evidence, cause = self.evidence, self._cause()
+        if cause and level is AlarmLevel.STOP:
+            self._cusum, self._sums = Cusum(), []  # only a further change may stop the scan
+            if self.alarm is not None:
+                return None
+            level = AlarmLevel.LOOK
+        why = f"{self._what} since row {since} ({basis}){cause and '; ' + cause}"
+        self.alarm = Alarm(level, row, since, evidence, why)
         return self.alarm
 
     def _sum_up(self, row: int, sigmas: float) -> None:
@@ -489,6 +515,34 @@ class ScanJudge:
     def _lasts(self) -> bool:
         rows = round(FITTED.lasting * len(self._comparer.place.templates[0].heights))
         return len(self._sums) >= rows and self._sums[-1] > self._sums[-1 - rows // 4]
+
+    def _cause(self) -> str:
+        # what explains the lines without a changed tip, or ""
+        suspects = [(row, line) for row, line in self._recent if self._is_suspect(row) and self.fitted.get(row)]
+        if not suspects:
+            return ""
+        before = [self.fitted[row] for row, _ in suspects]
+        again = replace(self._comparer, before=None)
+        if self._is_explained([again.fits(row, self._without_ends[row]) for row, _ in suspects]):
+            return "they lie at the end of the range of heights"
+        again = replace(self._comparer, before=None, cause=of_height)
+        after = [again.fits(row, line) for row, line in suspects]
+        if self._is_explained(after):
+            # on lamellae, slopes beside a pixel add up to its height, so that a large change looks like overshoot
+            return "they follow the height, as with another contrast" if is_slight(before, after) else ""
+        has_retrace = len(self._comparer.place.templates) > 1
+        if self._is_explained(without_overshoot(before, has_retrace=has_retrace)):
+            return "they follow each edge, as with a feedback that overshoots"
+        return ""
+
+    def _is_explained(self, lines: Sequence[Sequence[RowFit]]) -> bool:
+        # whether little of the sum is left, in enough lines that can still be compared
+        cusum, highest, compared = Cusum(), 0.0, [fits for fits in lines if fits]
+        for number, fits in enumerate(compared):
+            cusum.add(number, self._sigmas(fits))
+            highest = max(highest, cusum.value)
+        little = max(FITTED.elsewhere * self.threshold, FITTED.left * self._cusum.value)
+        return 2 * len(compared) > len(lines) and highest < little
 
     def _differ(self, lines: Sequence[tuple[int, Sequence[Array]]], where: NDArray[np.bool_]) -> bool:
         # fitted again: an adsorbate moves the shift of its line, which then differs everywhere (3 of 20 scans with a

@@ -333,7 +333,7 @@ class LineWatch(Component):
             alarm = running.judge.add(row, line)
             if alarm is not None:
                 self._announce(lines, running, alarm)
-            if not running.is_noisier and running.judge.noise >= NOISIER:
+            if not (running.is_noisier or running.judge.alarm) and running.judge.noise >= NOISIER:
                 running.is_noisier = True
                 what = "row %d: the noise is %.2f times the noise of earlier scans"
                 self.log.warning(what, row, running.judge.noise)

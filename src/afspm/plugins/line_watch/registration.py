@@ -8,7 +8,7 @@ part of the shift is fitted together with offset and tilt of the row: to first o
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,6 +20,9 @@ from afspm.components import SD_PER_MAD, Array
 
 Shift = tuple[float, float]
 """(rows, columns) from the running scan to the same feature in the template."""
+
+Cause = Callable[[Array], Array]
+"""A cause of another image: functions of a template's row to be fitted too, [pixel, function]."""
 
 FORGET = 0.85  # weight of the older rows in the cost of a shift
 LEAST_OVERLAP = 0.4  # share of a row that the template must cover
@@ -84,10 +87,12 @@ class RowFit:
     Attributes:
         residual: in m, NaN where not comparable.
         steepness: slope of the template at each pixel, in m per pixel.
+        expected: height of the template at each pixel, in m.
     """
 
     residual: Array
     steepness: Array
+    expected: Array
 
 
 class RowRegistration:
@@ -119,7 +124,13 @@ class RowRegistration:
         self._cost = cost if self._cost is None else FORGET * self._cost + cost
         self.shift = self._best(self._cost)
 
-    def fit(self, number: int, row: Array, template: RowTemplate | None = None) -> RowFit | None:
+    def fit(
+        self,
+        number: int,
+        row: Array,
+        template: RowTemplate | None = None,
+        cause: Cause | None = None,
+    ) -> RowFit | None:
         """Fit a levelled row to the template, and return the residual.
 
         Offset, tilt and the rest of the shift are fitted. None if the template covers too little of the row, or if a
@@ -128,6 +139,7 @@ class RowRegistration:
         Args:
             number: index of the row in the scan.
             template: another channel of the template's scan, for a row of that channel; None: the tracked template.
+            cause: see `Cause`; None: the image is as in the template.
         """
         template, (down, along) = template or self._template, self.shift
         ny, nx = template.heights.shape
@@ -145,10 +157,12 @@ class RowRegistration:
                 _row_at(picture, at, beside, order=1) for picture in (template.row_slopes, template.column_slopes)
             )
             basis = np.stack([np.ones(nx), np.linspace(-1.0, 1.0, nx), down_slope, along_slope], axis=1)
+            if cause is not None:
+                basis = np.concatenate([basis, cause(expected)], axis=1)
             difference = np.where(inside, row - expected, 0.0)
             residual, more = _unexplained(difference, basis, inside, moved, rounds)
             moved = np.clip(moved + more, -MOST_MOVED_PX, MOST_MOVED_PX)
-        return RowFit(residual, np.hypot(down_slope, along_slope))
+        return RowFit(residual, np.hypot(down_slope, along_slope), expected)
 
     def _costs(self, number: int, slopes: Array) -> Array | None:
         template, (rows, columns) = self._template, self._reach
@@ -292,17 +306,19 @@ def _unexplained(
     difference: Array, basis: Array, inside: NDArray[np.bool_], moved: Array, rounds: int
 ) -> tuple[Array, Array]:
     # several times, with less weight for outliers: pixels that a scar moved must not move the fit
-    weights, residual, found = inside.astype(np.float64), difference, np.zeros(4)
-    prior = np.array([0.0, 0.0, 1.0 / PRIOR_PX**2, 1.0 / PRIOR_PX**2])
-    pulled = prior * np.array([0.0, 0.0, *moved])
+    weights, residual, found = inside.astype(np.float64), difference, np.zeros(basis.shape[1])
+    prior, pulled = np.zeros((2, basis.shape[1]))
+    prior[4:] = 1.0  # some functions vanish in a row
+    prior[2:4] = 1.0 / PRIOR_PX**2
+    pulled[2:4] = prior[2:4] * moved
     for _ in range(rounds):
         unit = residual_spread(residual[inside])
         weighted = basis * (weights / unit**2)[:, None]
         matrix = weighted.T @ basis
-        matrix[[0, 1, 2, 3], [0, 1, 2, 3]] += prior
+        matrix += np.diag(prior)
         moment = weighted.T @ difference - pulled
         size = np.sqrt(matrix.diagonal())
         found = np.linalg.solve(matrix / np.outer(size, size), moment / size) / size
         residual = difference - basis @ found
         weights = np.where(inside, 1.0 / np.maximum(1.0, np.abs(residual) / (2.0 * unit)), 0.0)
-    return np.where(inside, residual, np.nan), found[2:]
+    return np.where(inside, residual, np.nan), found[2:4]
