@@ -32,7 +32,8 @@ class TipClassifier(Component):
         clear_after: good scans in a row until it is cleared.
         detail: share of the fine detail at a known place below which the tip is blunt.
         ghost: correlation of a ghost image at a known place above which the tip is double.
-        unrest: factor on the disagreement of trace and retrace above which the tip carries debris.
+        unrest: factor on the disagreement of trace and retrace, in single stretches of lines, above which the tip
+            carries debris; noise and hum are no disagreement.
         worn: share of the first scans' fine detail below which the tip is worn, at any place.
         sigmas: standard deviations of the reference beyond which a scan must lie to be bad; not for `worn`.
         problem: the problem to flag.

@@ -44,6 +44,9 @@ MOST_PLACES = 16
 DECIMALS = 4  # of an autocorrelation, to limit the saved state
 MOST_KINDS = 4  # of scans with a reference at the same time
 FOLLOW = 0.25  # least weight of a new good scan in the means of its place
+LEVEL_NOISES = 3.0  # standard deviations between stretches of a line, with a good tip
+NOISIER = 2.0  # times the usual noise, above which only unrest shows that a tip is bad
+UNCERTAIN = 0.99  # of the way to a limit
 FLOORS = TipMetrics(detail=0.02, ghost=0.01, unrest_m=0.15, contrast=0.0)  # least spreads: few scans underestimate them
 Fault = tuple[float, str, str]
 """A fault: its size relative to the limit for a bad scan (1), the flaw, and the reason."""
@@ -80,7 +83,7 @@ class TipTolerance:
     Attributes:
         detail: at a known place, the least share of the fine detail.
         ghost: at a known place, the largest correlation of a ghost image.
-        unrest: factor on the disagreement of trace and retrace.
+        unrest: factor on the disagreement of trace and retrace in single stretches of flat ground.
         worn: at any place, the least share of the first scans' fine detail.
         sigmas: least deviation of a bad scan, in standard deviations of the reference; not for `worn`.
         margin: a scan within this share of the way to a limit is good; from there to the limit a scan is unclear, so
@@ -319,8 +322,16 @@ class TipJudge:
 
     def _compare(self, reference: TipReference, place: KnownPlace | None, measured: TipMetrics) -> Verdict:
         faults = self._faults_anywhere(reference, measured)
+        usual = reference.usual_anywhere()
         if place is not None:
             faults += self._faults_here(reference, place, measured)
+            usual = place.usual
+        noisier = _relative(measured, usual).noise_m
+        if noisier > NOISIER:  # strong noise changes the other metrics, too
+            faults = [
+                (way if flaw == CONTAMINATED else min(way, UNCERTAIN), flaw, f"{why} in {noisier:.1f} times the noise")
+                for way, flaw, why in faults
+            ]
         worst = max(way for way, _, _ in faults)
         if worst >= 1.0:
             reference.suspect = reference.suspect or place is not None
@@ -350,7 +361,7 @@ class TipJudge:
         now = _relative(measured, usual)
         worn = f"worn: {now.detail:.0%} of the first scans' fine detail is left"
         faults = [((1.0 - now.detail) / (1.0 - tolerance.worn), BLUNT, worn)]
-        if usual.unrest_m > 0.0:  # zero without retrace
+        if measured.unrest_m > 0.0:  # zero without retrace
             limit = 1.0 + max(tolerance.unrest - 1.0, tolerance.sigmas * reference.spread("unrest_m"))
             what = f"{measured.unrest_m * 1e9:.2f} nm instead of {usual.unrest_m * 1e9:.2f} nm"
             faults.append(
@@ -403,10 +414,11 @@ def _kind_text(region: Region, shape: tuple[int, int]) -> str:
 
 def _relative(measured: TipMetrics, usual: TipMetrics) -> TipMetrics:
     # ghost and contrast are correlations already, and need no usual value
-    unrest = measured.unrest_m / usual.unrest_m if usual.unrest_m > 0 else 1.0
-    return TipMetrics(
-        measured.detail / usual.detail if usual.detail > 0 else 1.0, measured.ghost, unrest, measured.contrast
-    )
+    own = LEVEL_NOISES * usual.noise_m
+    unrest = (measured.unrest_m + own) / (usual.unrest_m + own) if own > 0 else 1.0
+    noise = measured.noise_m / usual.noise_m if usual.noise_m > 0 else 1.0
+    detail = measured.detail / usual.detail if usual.detail > 0 else 1.0
+    return TipMetrics(detail, measured.ghost, unrest, measured.contrast, noise)
 
 
 def _summary(measured: TipMetrics, usual: TipMetrics) -> str:

@@ -7,21 +7,22 @@ rather than the place:
   has both; a blunt tip loses the short wavelengths. (Heights of terraces, or the number of particles, scale both.) The
   power is the cross spectrum of trace and retrace, in which noise averages out.
 - `ghost`: the autocorrelation of the slopes away from zero. A second apex repeats every feature at one distance.
-- `unrest`: the disagreement of trace and retrace over stretches of flat ground, which loose debris causes and feedback
-  does not.
+- `unrest`: stretches of flat ground in which trace and retrace disagree far more than in the rest of the line, which
+  loose debris causes and feedback does not. Noise and hum fill the whole line, and count as `noise`.
 
 (Villarrubia 1997 for the effect of a tip on an image; the rest is standard signal analysis.)
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from afspm.basics.errors import InvalidValue
-from afspm.model.arrays import Array
+from afspm.model.arrays import SD_PER_MAD, Array
 
 # the long band ends at wavelengths of 32 pixels
 FEWEST_PIXELS = 32
@@ -30,6 +31,7 @@ SHORT_PX = (3.0, 8.0)  # wavelengths that a blunt tip loses
 LONG_PX = (8.0, 32.0)  # wavelengths that it keeps
 CORE_PX = 6.0  # lags within which any edge correlates with itself
 STRETCH = 10  # a stretch of a line is a tenth of it
+ALIKE = 3.0  # spreads of a line's stretches that are no unrest
 LEAST_CONTRAST = 0.1  # slopes common to trace and retrace, relative to those of noise
 
 
@@ -41,14 +43,17 @@ class TipMetrics:
         detail: short-wave against long-wave power of the slopes.
         ghost: largest autocorrelation of the slopes beside the centre, 0 to 1, beyond what was expected there; above 1
             if trace and retrace are displaced against each other, and the metrics mean nothing.
-        unrest_m: disagreement of trace and retrace over stretches, exceeded in a tenth of the lines; 0 without retrace.
+        unrest_m: disagreement of trace and retrace in single stretches, exceeded in a tenth of the lines; 0 without
+            retrace.
         contrast: power of the sample's slopes relative to noise; below `LEAST_CONTRAST` the other metrics mean nothing.
+        noise_m: standard deviation of the noise.
     """
 
     detail: float
     ghost: float
     unrest_m: float
     contrast: float
+    noise_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -125,6 +130,7 @@ def metrics(of: Slopes, correlation: Array, expected: Array | None = None) -> Ti
         ghost=ghost(correlation, expected),
         unrest_m=_unrest_m(of),
         contrast=(short + long) / noise if noise > 0 else float(short + long > 0) * 1e3,
+        noise_m=math.sqrt(noise / _white_power(of.trace.shape[1])),
     )
 
 
@@ -143,6 +149,9 @@ def ghost(correlation: Array, expected: Array | None = None) -> float:
 def _levelled(heights: Array) -> Array:
     values = _filled(np.array(heights, dtype=np.float64))
     tilt = np.median(np.diff(values, axis=1))
+    there = np.nonzero(np.ptp(values, axis=1) > 0.0)[0]  # some controllers fill lost rows with zeros
+    if there.size:  # a lost row is no ramp
+        values = values[there[np.abs(np.arange(len(values))[:, None] - there).argmin(axis=1)]]
     values = values - tilt * np.arange(values.shape[1])
     levelled: Array = values - np.median(values, axis=1, keepdims=True)
     return levelled
@@ -198,9 +207,20 @@ def _unrest_m(of: Slopes) -> float:
     count = window(flat, width, axis=1)[:, :: width // 2].sum(axis=-1)
     total = window(of.difference * flat, width, axis=1)[:, :: width // 2].sum(axis=-1)
     levels = np.where(count >= width // 3, total / np.maximum(count, 1), np.nan)
-    span = np.fmax.reduce(levels, axis=1) - np.fmin.reduce(levels, axis=1)
-    there = span[np.isfinite(span)]
-    return float(np.quantile(there, 0.9)) if there.size else 0.0
+    levels = levels[np.isfinite(levels).any(axis=1)]
+    if not levels.size:
+        return 0.0
+    off = np.abs(levels - np.nanmedian(levels, axis=1, keepdims=True))
+    own = SD_PER_MAD * np.nanmedian(off, axis=1)
+    own = np.maximum(own, np.median(own))  # of few stretches it may be small by chance
+    return float(np.quantile(np.maximum(0.0, np.nanmax(off, axis=1) - ALIKE * own), 0.9))
+
+
+def _white_power(slopes_per_line: int) -> float:
+    # of the slopes of white noise of 1, in the bands of `_band_powers`
+    frequency, window = np.fft.rfftfreq(slopes_per_line), np.hanning(slopes_per_line + 2)
+    chosen = (frequency >= 1 / LONG_PX[1]) & (frequency < 1 / SHORT_PX[0])
+    return float(np.sum(4.0 * np.sin(np.pi * frequency[chosen]) ** 2) * np.sum(window**2))
 
 
 def _flat(slope: Array) -> Array:

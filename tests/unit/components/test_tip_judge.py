@@ -75,6 +75,40 @@ def test_fault_found_at_a_known_place_is_not_cleared_elsewhere(seed: int, condit
     assert judged(judge, bad[-1]).opinion is not Opinion.GOOD
 
 
+def disturbed(pair: tuple[Scan, Scan], what: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the heights of a scan in another room."""
+    random = np.random.default_rng(7)
+    both = [scan.values.copy() for scan in pair]
+    time = 2.0 * PIXELS * np.arange(PIXELS)[:, None] + np.arange(PIXELS)
+    for values, at in zip(both, (time, time[:, ::-1] + PIXELS), strict=True):
+        if what == "hum":
+            values += 2e-9 * np.sin(2.0 * np.pi * at / 37.0)
+        elif what == "noise":
+            values += 1.5e-9 * random.standard_normal(values.shape)
+        elif what == "zero rows":  # of a tilted sample, in which a row of zeros is a ramp
+            values += 50e-9 * np.linspace(-1.0, 1.0, PIXELS)
+            values[random.permutation(PIXELS)[:9]] = 0.0
+        else:
+            for row in range(PIXELS):
+                if random.random() < 0.6:
+                    first = int(random.integers(PIXELS - 10))
+                    values[row, first : first + 30] += 4e-9
+    return both[0], both[1]
+
+
+@pytest.mark.parametrize("what", ["hum", "noise", "zero rows"])
+def test_noise_hum_and_lost_rows_are_no_bad_tip(what: str) -> None:
+    judge, good, _ = learnt(1, "double")
+    verdict = judge.judge(*disturbed(good[0], what), HOME)
+    assert verdict.opinion is not Opinion.BAD, verdict.why
+
+
+def test_streaks_are_a_bad_tip() -> None:
+    judge, good, _ = learnt(1, "double")
+    verdict = judge.judge(*disturbed(good[0], "streaks"), HOME)
+    assert verdict.flaws == ("contaminated",), verdict.why
+
+
 def test_trace_and_retrace_of_different_places_are_unclear() -> None:
     judge, good, _ = learnt(1, "double")
     trace, retrace = (scan.values for scan in good[0])
