@@ -614,7 +614,7 @@ class SimulatedInstrument:
         """
         self._check_free(now_s)
         self.occupy("approach", self.setup.approach_s + self.coarse_m / _APPROACH_M_PER_S, now_s)
-        self._lands_s = self._doing.end_s if self._doing is not None and not self.engaged else None
+        self._lands_s = self._doing.end_s if self._doing is not None else None
         self._lifts_s = None if seems_s is None or self._lands_s is None else self._lands_s + seems_s
 
     def approaches(self, now_s: float) -> bool:
