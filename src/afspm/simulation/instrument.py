@@ -184,7 +184,8 @@ class SimulatedInstrument:
     def doing(self, now_s: float) -> str:
         """Return the activity: "scan", "spectrum", "move", or the name given to `occupy`; empty if free."""
         if self._lands_s is not None and now_s >= self._lands_s:
-            self.note(self._lands_s, "landed", {"seems": self._lifts_s is not None})
+            if not self.engaged:
+                self.note(self._lands_s, "landed", {"seems": self._lifts_s is not None})
             self._lands_s, self.coarse_m, self.engaged = None, 0.0, True
         if self._lifts_s is not None and now_s >= self._lifts_s:
             self._lifts_s, self.coarse_m, self.engaged = None, _FALSELY_M, False
