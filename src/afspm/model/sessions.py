@@ -22,12 +22,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum, auto
 from functools import lru_cache
-from typing import TypeVar
 
-from afspm.basics.frozen import replace
+from afspm.basics.frozen import replace, without
 
-K = TypeVar("K")
-V = TypeVar("V")
 # tokens of earlier sessions of a name that may still come back
 _FORMERS = 8
 _RUN = re.compile("[0-9a-f]{16}")
@@ -122,15 +119,15 @@ class SessionTable:
 
     def disconnected(self, connection: int, now_s: float) -> tuple[SessionTable, str | None]:
         """Drop a connection; also return the name of the session that used it, if any."""
-        table = replace(self, order=self.order + 1, opened=_without(self.opened, connection))
+        table = replace(self, order=self.order + 1, opened=without(self.opened, connection))
         name = self.name_of.get(connection)
         if name is None:
             return table, None
         session = replace(self.names[name], connection=None, lost_order=table.order, lost_s=now_s)
         names, lost = {**self.names, name: session}, (*self.lost, name)
         if len(lost) > self.keep:
-            names, lost = _without(names, lost[0]), lost[1:]
-        return replace(table, names=names, lost=lost, name_of=_without(self.name_of, connection)), name
+            names, lost = without(names, lost[0]), lost[1:]
+        return replace(table, names=names, lost=lost, name_of=without(self.name_of, connection)), name
 
     def hear(self, connection: int, name: str, request_id: str | None, now_s: float) -> tuple[SessionTable, Hearing]:
         """Judge a message from `name` over `connection`; bind the name if the message is accepted.
@@ -212,7 +209,3 @@ class SessionTable:
         session = _Session(token, connection, formers, has_ids=has_ids, since_s=since_s)
         lost = tuple(one for one in self.lost if one != name)
         return replace(self, names={**self.names, name: session}, name_of={**name_of, connection: name}, lost=lost)
-
-
-def _without(mapping: Mapping[K, V], key: K) -> dict[K, V]:
-    return {one: value for one, value in mapping.items() if one != key}

@@ -52,13 +52,13 @@ class Motor:
 
     def refusal(self, action: str) -> Response:
         """Ask for an action, and return its refusal; it is refused for certain."""
-        found = self._asked(action)
+        found = self.asks(action)
         assert found is not None, f"{action} was sent"
         return found
 
     def does(self, action: str, code: ControlResponse = ControlResponse.SUCCESS) -> None:
         """Ask for an action, which is sent, and let the translator answer it."""
-        found = self._asked(action)
+        found = self.asks(action)
         assert found is None, found
         detail = ResponseDetail.OUTCOME_UNKNOWN if code == ControlResponse.NO_RESPONSE else ResponseDetail.NONE
         flight = self.lab.in_flight()
@@ -66,7 +66,7 @@ class Motor:
         self.lab.answer(flight, code, detail=detail)
         self.lab.scope_is(ScopeState.FREE)
 
-    def _asked(self, action: str) -> Response | None:
+    def asks(self, action: str) -> Response | None:
         self.number += 1
         asked = f"experiment/1/{self.number}"
         effects = self.lab.ask("experiment", ACTION, action, asked)
@@ -292,7 +292,7 @@ def test_steps_of_before_an_approach_do_not_count_after_it(motor: Motor) -> None
 def test_steps_count_when_they_are_made(motor: Motor) -> None:
     motor.withdraws()
     motor.does(AWAY)
-    motor._asked(AWAY)
+    motor.asks(AWAY)
     flight = motor.lab.in_flight()
     assert flight is not None
     motor.lab.answer(flight)  # accepted

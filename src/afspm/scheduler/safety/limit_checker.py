@@ -288,14 +288,22 @@ class LimitChecker:
                 found.append((name, 0.0 if before is None else abs(value - before.value)))
         return found
 
+    def _moving(self, who: str, request: Request, *, is_repeated: bool) -> LimitChecker:
+        settings, moved = self.limits.movers, self.state.movers
+        for name, way in self._moves(request):
+            moved = moved.sent(settings, name, way, f"{who} {request.id}", is_repeated=is_repeated)
+        action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
+        if action in names.APPROACHES:
+            moved = moved.approaching(settings, action)
+        elif action == names.RETRACT:
+            moved = moved.withdrawn()
+        elif self._switches_on(request):
+            moved = moved.near()
+        return self._with_movers(moved)
+
     def _switches_on(self, request: Request) -> bool:
         values = (forbidden_states.values_in(subject).get(names.FEEDBACK_ON) for subject in self._set_by(request))
-        return any(value is not None and (value.value or "").lower() in names.ON_WORDS for value in values)
-
-    @property
-    def _reads_engaged(self) -> bool:
-        seen = self.state.last_seen.get(names.ENGAGED)
-        return seen is not None and (seen.value or "").lower() in names.ON_WORDS
+        return any(map(movers.is_on, values))
 
     def _check_movers(self, request: Request) -> None:
         settings, state = self.limits.movers, self.state.movers
@@ -312,7 +320,8 @@ class LimitChecker:
                 raise _Breach(ControlResponse.ACTION_ERROR, f"{action}: {why}", again_ns)
         if action in names.APPROACHES and state.is_unproved and action != settings.approach:
             raise _Breach(ControlResponse.ACTION_ERROR, f"{action} may not reach the sample: {_unproved(settings)}")
-        if state.is_unproved and self._switches_on(request) and not self._reads_engaged:
+        is_away = not movers.is_on(self.state.last_seen.get(names.ENGAGED))
+        if state.is_unproved and is_away and self._switches_on(request):
             raise _Breach(_error_of(request), f"the feedback would bring the tip to the sample: {_unproved(settings)}")
 
     def unknown(self, request: Request) -> LimitChecker:
@@ -340,20 +349,13 @@ class LimitChecker:
 
         The time of a change is unknown until the request has settled, so values with a limited rate are set aside.
         """
-        usage, moved = self.state.usage, self.state.movers
-        for name, way in self._moves(request):
-            moved = moved.sent(self.limits.movers, name, way, f"{who} {request.id}", is_repeated=is_repeated)
-        if request.kind == ControlRequest.ACTION and request.subject in names.APPROACHES:
-            moved = moved.approaching(self.limits.movers, str(request.subject))
-        elif self._switches_on(request):
-            moved = moved.near()
-        elif request.kind == ControlRequest.ACTION and request.subject == names.RETRACT:
-            moved = moved.withdrawn()
+        usage = self.state.usage
         for name in self._counted_uses(request, used):
             usage = usage.use_sent(name, LastUse(now_ns, who, request.id))
         for name in self.limits.rated.intersection(self.names_set_by(request)) if self.limits.rated else ():
             usage = usage.changing(name)
-        return self._with_usage(usage)._with_movers(moved)
+        checker = self._with_usage(usage)
+        return checker._moving(who, request, is_repeated=is_repeated) if self.limits.movers.movers else checker
 
     def counts(self, request: Request) -> bool:
         """Return whether the interval between two requests of this kind is limited."""

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TypeVar
 
-from afspm.basics.frozen import replace
+from afspm.basics.frozen import replace, without
 from afspm.model import Parameter
 from afspm.model.positions import KnownPosition
 from afspm.scheduler.safety.movers import MoverState
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -68,25 +65,25 @@ class Usage:
         if known is not None and known.value == value:
             return self
         new = replace(known, value=value) if known is not None and was_read else KnownValue(value, now_ns, value)
-        return replace(self, known={**self.known, name: new}, before=_without(self.before, name))
+        return replace(self, known={**self.known, name: new}, before=without(self.before, name))
 
     def forget(self, name: str) -> Usage:
         """Remove a value that is no longer known."""
         if name not in self.known and name not in self.before:
             return self
-        return replace(self, known=_without(self.known, name), before=_without(self.before, name))
+        return replace(self, known=without(self.known, name), before=without(self.before, name))
 
     def changing(self, name: str) -> Usage:
         """Set a value aside until the outcome and the time of its change are known."""
         if name not in self.known:
             return self
-        return replace(self, known=_without(self.known, name), before={**self.before, name: self.known[name]})
+        return replace(self, known=without(self.known, name), before={**self.before, name: self.known[name]})
 
     def unchanged(self, name: str) -> Usage:
         """Restore a value that was set aside: it was not changed."""
         if name not in self.before:
             return self
-        return replace(self, known={**self.known, name: self.before[name]}, before=_without(self.before, name))
+        return replace(self, known={**self.known, name: self.before[name]}, before=without(self.before, name))
 
     def last_ns(self, name: str, repeated: tuple[str, str] | None = None) -> int | None:
         """Return the experiment time of the last use; None without a use.
@@ -101,13 +98,13 @@ class Usage:
         return replace(self, sent={**self.sent, name: use})
 
     def use_done(self, name: str, use: LastUse) -> Usage:
-        return replace(self, done={**self.done, name: use}, sent=_without(self.sent, name))
+        return replace(self, done={**self.done, name: use}, sent=without(self.sent, name))
 
     def use_undone(self, name: str, who: str, request_id: str) -> Usage:
         """Remove a use that was not carried out."""
         use = self.sent.get(name)
         is_it = use is not None and (use.who, use.request_id) == (who, request_id)
-        return replace(self, sent=_without(self.sent, name)) if is_it else self
+        return replace(self, sent=without(self.sent, name)) if is_it else self
 
 
 @dataclass(frozen=True)
@@ -123,7 +120,3 @@ class LimitState:
     position: KnownPosition = field(default_factory=KnownPosition)
     last_seen: Mapping[str, Parameter] = field(default_factory=dict)
     movers: MoverState = field(default_factory=MoverState)
-
-
-def _without(uses: Mapping[str, T], name: str) -> dict[str, T]:
-    return {other: use for other, use in uses.items() if other != name}

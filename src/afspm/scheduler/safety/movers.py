@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 from afspm.basics.formatting import quantity
-from afspm.basics.frozen import replace
+from afspm.basics.frozen import replace, without
 from afspm.model import Parameter, names
 
 Direction = Literal["lateral", "away"]
@@ -121,11 +121,12 @@ class MoverState:
 
     def done(self, request: str) -> MoverState:
         """Take the answer that a move was made, or has begun."""
-        return replace(self, pending=_without(self.pending, request), answered=self.answered + self._pending(request))
+        made = self.pending.get(request, 0)
+        return replace(self, pending=without(self.pending, request), answered=self.answered + made)
 
     def undone(self, name: str, way: float, request: str) -> MoverState:
         """Take back a request that was certainly not carried out. An approach is still needed."""
-        return replace(self._with_way(name, -way), pending=_without(self.pending, request))
+        return replace(self._with_way(name, -way), pending=without(self.pending, request))
 
     def free(self) -> MoverState:
         """Count the answered steps away: the microscope is free."""
@@ -159,7 +160,7 @@ class MoverState:
 
     def read(self, values: Mapping[str, Parameter | None], now_ns: int) -> MoverState:
         """Take in `SIGNAL` as read for a decision; a second reading at the sample proves the tip there."""
-        if not _is_on(values):
+        if not is_on(values.get(names.ENGAGED)):
             return replace(self, at_sample_ns=None)
         state = self.near()
         if not self.is_unproved or self.needs_approach or not _has_signal(values):
@@ -188,16 +189,8 @@ class MoverState:
     def _with_way(self, name: str, way: float) -> MoverState:
         return replace(self, ways={**self.ways, name: self.ways.get(name, 0.0) + way})
 
-    def _pending(self, request: str) -> int:
-        return self.pending.get(request, 0)
 
-
-def _without(pending: Mapping[str, int], request: str) -> dict[str, int]:
-    return {one: steps for one, steps in pending.items() if one != request}
-
-
-def _is_on(values: Mapping[str, Parameter | None]) -> bool:
-    shown = values.get(names.ENGAGED)
+def is_on(shown: Parameter | None) -> bool:
     return shown is not None and (shown.value or "").lower() in names.ON_WORDS
 
 
