@@ -53,15 +53,15 @@ class MeasurementSetup:
         Raises as `InstrumentTargets.reach` and `Withdrawal.bring_back`; returns early if control is lost.
         """
         others = [one for one in target.settings if is_of_instrument(one.name)]
-        if not target.withdraws:
+        if target.aside is None:
             return tuple(self._targets.reach(one, until_s) for one in others)
         try:
             # after a loss of control others may move the tip: nothing in the block goes on
             with self._control.hold(until_s=until_s, unbroken=True):
                 if not all(self._targets.is_reached(one, until_s) for one in others):
-                    self._withdrawal.withdraw(until_s, target.away)
+                    self._withdrawal.withdraw(until_s, target.aside)
                 reached = tuple(self._targets.reach(one, until_s) for one in others)
-                self._withdrawal.bring_back(until_s, approaches=bool(target.away))
+                self._withdrawal.bring_back(until_s, approaches=bool(target.aside))
         except ControlLost:
             return ()  # the measurement begins again, with its targets
         return reached

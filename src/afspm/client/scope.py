@@ -321,13 +321,12 @@ class Scope(ExperimentView):
             raise InvalidValue(
                 "a sweep measures nothing at its points", where="sweep", hint="list a region or position"
             )
-        away = () if isinstance(withdraw, bool) else tuple(withdraw)
-        targets = [replace(one, withdraws=bool(withdraw), away=away) for one in targets]
+        aside = None if not withdraw else () if withdraw is True else tuple(withdraw)
+        targets = [replace(one, aside=aside) for one in targets]
         key = key and check_key(key)
         former = self._former([axis.name for axis in plan.axes], key, partial(values_between, plan))
         sweep = ParameterSweep(plan, targets, key, former, runner=self._runner, results=self._results)
         until_s = self._link.until(timeout_s)
-        aside = away if withdraw else None
         with self._control.hold(until_s=until_s, keeps=True), self._setting_back(former, timeout_s, aside):
             self._sweeps = True
             try:

@@ -31,16 +31,15 @@ class ScanTarget:
         shape: (rows, columns).
         settings: parameters of a sweep, set before each attempt.
         point: number of the sweep's point; None outside of a sweep.
-        withdraws: whether the tip is withdrawn while another instrument goes to its target.
-        away: the actions that move it away then, before the instrument goes.
+        aside: the actions (none, too) that move a withdrawn tip away while another instrument goes to its target;
+            None: the tip stays.
     """
 
     region: Region | None
     shape: tuple[int, int] | None
     settings: tuple[Parameter, ...] = ()
     point: int | None = None
-    withdraws: bool = False
-    away: tuple[str, ...] = ()
+    aside: tuple[str, ...] | None = None
 
     what: ClassVar = "scan"
     action: ClassVar = names.START_SCAN
@@ -100,8 +99,8 @@ class SpectrumTarget:
     Attributes:
         settings: parameters of the curve or of a sweep, set before each attempt.
         point: number of the sweep's point; None outside of a sweep.
-        withdraws: whether the tip is withdrawn while another instrument goes to its target.
-        away: the actions that move it away then, before the instrument goes.
+        aside: the actions (none, too) that move a withdrawn tip away while another instrument goes to its target;
+            None: the tip stays.
     """
 
     at_m: XY | None
@@ -109,8 +108,7 @@ class SpectrumTarget:
     frame: Frame = Frame.TIP
     settings: tuple[Parameter, ...] = ()
     point: int | None = None
-    withdraws: bool = False
-    away: tuple[str, ...] = ()
+    aside: tuple[str, ...] | None = None
 
     what: ClassVar = "spectrum"
     action: ClassVar = names.START_SPEC
@@ -151,11 +149,7 @@ Target = ScanTarget | SpectrumTarget
 
 def _facts(target: Target) -> Plain:
     facts = to_plain(target)
-    del (
-        facts["point"],
-        facts["withdraws"],
-        facts["away"],
-    )  # the key has the number; how a target is reached changes no result
+    del facts["point"], facts["aside"]  # the key has the number; how a target is reached changes no result
     if not target.settings:
         del facts["settings"]
     return {"what": target.what, **facts}
