@@ -154,9 +154,8 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
     resolved.conditions = conditions_section.ConditionsReader(
         document, resolved.instruments, reader.actions, resolved.problems
     ).read(parts.sections.get("conditions", {}))
-    drifts = any(DRIFT in scheduler.declared.publishes for scheduler in resolved.with_role(Role.SCHEDULER))
     lateral = [name for name, one in resolved.limits.movers.movers.items() if one.direction == "lateral"]
-    for name in lateral if drifts else ():
+    for name in lateral if _corrects_drift(resolved) else ():
         what = f"[limits.movers] {name} moves the sample along, and sample coordinates of before do not hold after it"
         hint = 'take the scheduler without drift correction: class = "Scheduler"'
         document.error(what, "limits", "movers", name, hint=hint)
@@ -193,6 +192,10 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
     for name, plan in resolved.plans.items():
         if what := planned_measurements.too_slow(plan, usual_m_s):
             resolved.warning(f"[{name}] {what}", name, "every", hint="rounds that come too late are left out")
+
+
+def _corrects_drift(resolved: ResolvedExperiment) -> bool:
+    return any(DRIFT in scheduler.declared.publishes for scheduler in resolved.with_role(Role.SCHEDULER))
 
 
 def _check_channels(process: ResolvedProcess, component: type, document: Document, there: ChannelRoles) -> None:
@@ -340,7 +343,7 @@ def _resolve_plan(
     for refusal in planned_measurements.refusals(name, plan, resolved.limits):
         what = f"[{name}] plans what its limits refuse: {refusal.reason}"
         resolved.document.error(what, name, *refusal.where, hint=refusal.hint)
-    if any(DRIFT in scheduler.declared.publishes for scheduler in resolved.with_role(Role.SCHEDULER)):
+    if _corrects_drift(resolved):
         for doubt in plan.drift_doubts:
             resolved.document.warning(f"[{name}] {doubt.what}", name, doubt.where, hint=doubt.hint)
     if has is None:

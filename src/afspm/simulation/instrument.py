@@ -613,10 +613,10 @@ class SimulatedInstrument:
         Args:
             seems_s: how long the tip seems to be at the sample, though it is not; None: it is.
         """
-        self._check_free(now_s)
-        self.occupy("approach", self.setup.approach_s + self.coarse_m / _APPROACH_M_PER_S, now_s)
-        self._lands_s = self._doing.end_s if self._doing is not None else None
-        self._lifts_s = None if seems_s is None or self._lands_s is None else self._lands_s + seems_s
+        lasts_s = self.setup.approach_s + self.coarse_m / _APPROACH_M_PER_S
+        self.occupy("approach", lasts_s, now_s)
+        self._lands_s = now_s + lasts_s
+        self._lifts_s = None if seems_s is None else self._lands_s + seems_s
 
     def approaches(self, now_s: float) -> bool:
         """Return whether the coarse motor brings the tip to the sample."""

@@ -34,9 +34,8 @@ OF_MODEL, OF_BLOCKS, BY_LEVERAGE = 3.0, 2.0, 0.8
 
 The likelihood of the errors is largest with 0.3 to 0.5 for `OF_BLOCKS`, but then ellipses of 95 % hold 36 to 80 % of
 the pairs of another program whose lines wander in one axis, or relax; with 1.2 they hold 64 to 93 %, and with 2 they
-hold 82 to 96 %. If the mean wander of a frame counted as an
-error, no factor would fit: with 4, chi² per degree of freedom is 1.8 for waves of a few rows, and 15 for a random walk
-that is slower than a frame."""
+hold 82 to 96 %. If the mean wander of a frame counted as an error, no factor would fit: with 4, chi² per degree of
+freedom is 1.8 for waves of a few rows, and 15 for a random walk that is slower than a frame."""
 LINEAR_OF_MODEL, LINEAR_BY_VARIED, LINEAR_BY_LEVERAGE = 2.0, 1.27, 0.64
 """Factor on the model's covariance of the linear part, and its exponents.
 
