@@ -9,6 +9,7 @@ must be learnt from the same two noisy scans.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from afspm.plugins.drift.doubt.covariance import Doubt, covariance
 from afspm.plugins.drift.doubt.nuisances import CREEP_SD_PX, Shear, averaged
 from afspm.plugins.drift.pairs.images import CommonGrid, Unusable, onto_common_grid, prepare
 from afspm.plugins.drift.pairs.noise import CrossingLines, FineFilter, without_lines
+from afspm.plugins.drift.pairs.oversampling import with_larger_pixels
 from afspm.plugins.drift.pairs.spikes import without_scars_of_one, without_spikes
 from afspm.plugins.drift.pairs.warp import COUNT, CREEP, LINEAR, SLOPES, OverlapBox, Scene, WarpedPair
 from afspm.plugins.drift.registration import DriftScan, LinearSeen, Prior, Registration
@@ -80,20 +82,25 @@ class LeastSquares:
         grid, *on_grid = onto_common_grid(reference, images[0], scan, images[1])
         scene, expected = Scene(on_grid[0], on_grid[1]), None if prior is None else ExpectedShift.of(prior, grid)
         start = _coarse(scene, expected)
-        box = None if start is None else scene.box(start[0][:2])
-        if start is None or box is None:
+        if start is None:
+            return Registration.refused("the scans overlap too little")
+        coarse, *likelihoods = start
+        scene, grid, coarse = with_larger_pixels(scene, grid, coarse)
+        expected = None if prior is None else ExpectedShift.of(prior, grid)
+        box = scene.box(coarse[:2])
+        if box is None:
             return Registration.refused("the scans overlap too little")
         try:
             shear = _expected_shear(prior, reference, scan, grid)
             lines = _Lines.of(reference, scan, grid)
-            theta, model, seen, doubt = _fine(scene, box, start[0], lines, expected, shear)
+            theta, model, seen, doubt = _fine(scene, box, coarse, lines, expected, shear)
         except Unusable as reason:
             rows, columns = box.shape
             return Registration.refused(f"the overlap of {columns} x {rows} pixels is {reason}")
-        if not (np.isfinite(model).all() and np.hypot(*(theta - start[0])[:2]) < FARTHEST_PX):
+        if not (np.isfinite(model).all() and np.hypot(*(theta - coarse)[:2]) < FARTHEST_PX):
             return Registration.refused("no displacement fits: the scans have no features in common")
         by_model = model[:2, :2]
-        found = _evidence(scene, box, theta, doubt.spread_of_evidence * by_model, start[1:], expected)
+        found = _evidence(scene, box, theta, doubt.spread_of_evidence * by_model, likelihoods, expected)
         shift = doubt.shift(model)
         registration = self._registration(theta, shift, box, grid, found)
         wider = math.sqrt(float(np.linalg.det(shift) / np.linalg.det(by_model)))
@@ -211,7 +218,7 @@ def _evidence(
     box: OverlapBox,
     theta: Array,
     total: Array,
-    likelihoods: tuple[float, float],
+    likelihoods: Sequence[float],
     expected: ExpectedShift | None,
 ) -> MatchEvidence:
     one, two, known = WarpedPair(*scene.smooth_splines, box, theta[:2]).warped(theta)

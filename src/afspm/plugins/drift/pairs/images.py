@@ -262,6 +262,11 @@ class CommonGrid:
         position: Array = self.to_m @ position_px + self.reference_m
         return position
 
+    def halved(self, reference_px: Array, scan_px: Array) -> CommonGrid:
+        """Return the grid with pixels twice as large, and the centres moved back by these pixels."""
+        moved = (self.reference_m - self.to_m @ reference_px, self.scan_m - self.to_m @ scan_px)
+        return CommonGrid(2.0 * self.to_m, 2.0 * self.to_own, *moved)
+
     def linear_m(self, linear_px: Array) -> Array:
         """Convert a linear map of pixel coordinates to tip coordinates."""
         linear: Array = self.to_m @ linear_px @ np.linalg.inv(self.to_m)
