@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 from benchmarks.drift import fit
 from benchmarks.drift.trials import Outcome
+from scipy.ndimage import gaussian_filter
 
-from afspm.plugins.drift.doubt.acceptance import MatchEvidence
+from afspm.components import Array
+from afspm.plugins.drift.doubt.acceptance import MatchEvidence, texture
 
 GOOD = MatchEvidence(
     overlap=0.8, sd_px=0.02, gap=300.0, rival=0.05,
-    agreement=1.0, above_repeats=math.inf, surprise=1.0, searched=1.0,
+    agreement=1.0, above_repeats=math.inf, texture=math.inf, surprise=1.0, searched=1.0,
 )  # fmt: skip
 
 
@@ -49,6 +51,34 @@ def test_a_likely_rival_is_refused_unless_the_displacement_is_expected() -> None
     assert repeated.wrong < 0.05
     assert "another displacement explains 80%" in repeated.refusal(0.05)
     assert replace(repeated, searched=0.01).refusal(0.05) == ""
+
+
+def test_bare_ground_without_an_expected_displacement_needs_ten_times_the_certainty() -> None:
+    bare = replace(GOOD, texture=0.3, gap=50.0)
+    assert 0.005 < bare.wrong < 0.05
+    assert "the ground between the features shows nothing in common (0.3 " in bare.refusal(0.05)
+    assert replace(bare, texture=2.0).refusal(0.05) == ""
+    assert replace(bare, gap=300.0).refusal(0.05) == ""
+    assert replace(bare, searched=0.01).refusal(0.05) == ""
+
+
+def test_texture_between_features_agrees_at_the_same_place_alone() -> None:
+    """Two bumps of one shape match wherever they are; the ground around them does not."""
+    random = np.random.default_rng(7)
+    y, x = np.mgrid[:96, :96] - 47.5
+    bump, known = 8.0 * np.exp(-(x**2 + y**2) / 200.0), np.ones((96, 96), dtype=bool)
+
+    def ground() -> Array:
+        fine = gaussian_filter(random.standard_normal((96, 96)), 2.5)
+        return np.asarray(fine / fine.std())
+
+    def seen(surface: Array) -> Array:
+        return np.asarray(gaussian_filter(bump + surface + random.standard_normal((96, 96)), 1.0))
+
+    faint, elsewhere, rough = 0.25 * ground(), 0.25 * ground(), 3.0 * ground()
+    assert texture(seen(faint), seen(faint), known) > 3.0
+    assert texture(seen(faint), seen(elsewhere), known) < 2.0
+    assert texture(seen(rough), seen(rough), known) == math.inf
 
 
 def test_the_fit_gives_calibrated_probabilities() -> None:

@@ -19,6 +19,15 @@ def test_gratings_of_other_places_are_refused(seed: int) -> None:
     assert "the surface repeats itself" in found.reason
 
 
+@pytest.mark.parametrize("seed", [7001, 7003, 7004])
+def test_relaxing_gratings_match_at_the_right_period(seed: int) -> None:
+    """Without its own distortion for each candidate the best match is one or two periods off."""
+    made = grating("relaxing", seed)
+    found = LeastSquares().register(made.reference, made.scan)
+    at_px = found.center_m / PIXEL_M - made.center_px
+    assert np.hypot(*(found.displacement_m / PIXEL_M - made.moved_px - made.linear @ at_px)) < 1.0
+
+
 @pytest.mark.parametrize("seed", [1020, 1030, 1047])
 def test_relaxing_gratings_are_never_accepted_a_period_off(seed: int) -> None:
     """Their best match is, and a prediction that is good to a part of the period decides."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from afspm.basics import ConfigError
 from afspm.components import Array
-from afspm.plugins.drift.doubt.acceptance import WRONG_AT_MOST, MatchEvidence, above_repeats, agreement
+from afspm.plugins.drift.doubt.acceptance import WRONG_AT_MOST, MatchEvidence, above_repeats, agreement, texture
 from afspm.plugins.drift.doubt.covariance import Doubt, covariance
 from afspm.plugins.drift.doubt.nuisances import CREEP_SD_PX, Shear, averaged
 from afspm.plugins.drift.pairs.images import CommonGrid, Unusable, onto_common_grid, prepare
@@ -25,8 +25,15 @@ from afspm.plugins.drift.pairs.oversampling import with_larger_pixels
 from afspm.plugins.drift.pairs.spikes import without_scars_of_one, without_spikes
 from afspm.plugins.drift.pairs.warp import COUNT, CREEP, LINEAR, SLOPES, OverlapBox, Scene, WarpedPair
 from afspm.plugins.drift.registration import DriftScan, LinearSeen, Prior, Registration
-from afspm.plugins.drift.registration.alignment import COARSE, SHIFT, Believed, generalised_least_squares, least_squares
-from afspm.plugins.drift.registration.search import ExpectedShift, MaskedCorrelation, Scorer, candidates, shear_by_drift
+from afspm.plugins.drift.registration.alignment import Believed, generalised_least_squares
+from afspm.plugins.drift.registration.search import (
+    ExpectedShift,
+    MaskedCorrelation,
+    Scorer,
+    candidates,
+    distorted,
+    shear_by_drift,
+)
 
 WIDEST = (0.01, 0.03)  # prior standard deviations of shear and rotation in the first stage, by x and by y
 GAIN_SD = 1.0  # prior standard deviation of the logarithm of the gain
@@ -128,14 +135,12 @@ def _coarse(scene: Scene, expected: ExpectedShift | None) -> tuple[Array, float,
     # theta within a fraction of a pixel, its log-likelihood and the likelihood of the best rival
     small, factor, offset = scene.smaller()
     scaled = None if expected is None else expected.on_smaller(factor, offset)
-    best = Scorer(small, scaled).best(candidates(small, scaled))
+    believed = _believed(scaled)
+    best = Scorer(small, scaled).best(candidates(small, scaled), believed)
     box = None if best is None else small.box(best[0].shift_px)
     if best is None or box is None:
         return None
-    pair = WarpedPair(*small.smooth_splines, box)
-    theta = np.concatenate([best[0].shift_px, np.zeros(COUNT - 2)])
-    theta = least_squares(pair, theta, _believed(scaled), SHIFT, steps=4)
-    theta = least_squares(pair, theta, _believed(scaled), COARSE, steps=4)
+    theta = distorted(small, box, best[0].shift_px, believed)
     theta[:2] = theta[:2] * factor + offset
     return theta, best[0].likelihood, best[1]
 
@@ -231,6 +236,7 @@ def _evidence(
         rival=likelihoods[1] / max(likelihoods[0], 1e-300),
         agreement=agreement(one, two, known),
         above_repeats=above_repeats(elsewhere.of(one, two), elsewhere.overlap, elsewhere.origin),
+        texture=texture(one, two, known),
         surprise=0.0 if expected is None else expected.surprise(theta[:2], total),
         searched=1.0 if expected is None else min(expected.area_px2 / scene.least_known, 1.0),
     )

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from afspm.components import Array
 from afspm.plugins.drift.pairs.images import CommonGrid, Mask
 from afspm.plugins.drift.pairs.noise import independent_values, without_lines
-from afspm.plugins.drift.pairs.warp import COUNT, Scene, WarpedPair
+from afspm.plugins.drift.pairs.warp import COUNT, OverlapBox, Scene, WarpedPair
 from afspm.plugins.drift.registration import DriftScan, Prior
-from afspm.plugins.drift.registration.alignment import SHIFT, Believed, least_squares
+from afspm.plugins.drift.registration.alignment import COARSE, SHIFT, Believed, least_squares
 
 GATE = 25.0  # chi² of an expected shift, the limit of the search
 
@@ -176,6 +176,15 @@ class MaskedCorrelation:
 
 NOTHING_BELIEVED = Believed(np.zeros(COUNT), np.zeros((COUNT, COUNT)))
 OTHER_PX = 2.0  # a second-best shift nearer than this is the same match
+LEFT_PX = 4.0  # steps beyond this have left the peak of their candidate
+REPEATS = 0.65
+"""Share of the best likelihood, from which a rival makes the search fit the distortion of every candidate.
+
+Above it afterwards, too, a match that was not expected is refused.
+
+Where a sample relaxes, likelihoods without distortion compare how well each period happens to fit the relaxation. Of 24
+relaxing gratings (1.5 to 6 px) 7 had their best match a period off, and none after each candidate had its own linear
+map: it raised the likelihood of right matches by up to 130 %, of others by some 10 %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,14 +206,18 @@ class Scorer:
             for splines, values in ((scene.smooth_splines, scene.smooth), (scene.band_splines, scene.band))
         ]
 
-    def best(self, shifts: list[Array]) -> tuple[Scored, float] | None:
-        """Return the most likely shift and the log-likelihood of its best rival; None without enough overlap."""
+    def best(self, shifts: list[Array], believed: Believed) -> tuple[Scored, float] | None:
+        """Return the most likely shift and the log-likelihood of its best rival; None without enough overlap.
+
+        Where a rival explains more than `REPEATS` as much, each candidate is scored with its own fit of the distortion.
+        """
         scored = [s for s in map(self._score, shifts) if s is not None]
         if not scored:
             return None
-        best = max(scored, key=lambda s: s.likelihood)
-        rest = [s.likelihood for s in scored if np.hypot(*(s.shift_px - best.shift_px)) > OTHER_PX]
-        return best, max(rest, default=0.0)
+        best, rival = _ranked(scored)
+        if rival > REPEATS * best.likelihood:
+            best, rival = _ranked([self._score_distorted(s, believed) for s in scored])
+        return best, rival
 
     def _score(self, shift: Array) -> Scored | None:
         box = self._scene.box(shift)
@@ -212,14 +225,41 @@ class Scorer:
             return None
         theta = np.concatenate([shift, np.zeros(COUNT - 2)])
         theta = least_squares(WarpedPair(*self._scene.smooth_splines, box), theta, NOTHING_BELIEVED, SHIFT, steps=2)
-        if np.hypot(*(theta[:2] - shift)) > 4.0:  # the steps have left the peak of this candidate
+        if np.hypot(*(theta[:2] - shift)) > LEFT_PX:
             theta[:2] = shift
-        likelihood = 0.0 if self._expected is None else -0.5 * float(self._expected.chi2(theta[:2]))
+        surprise = 0.0 if self._expected is None else float(self._expected.chi2(theta[:2]))
+        return Scored(theta[:2], self._likelihood(box, theta) - surprise / 2)
+
+    def _score_distorted(self, scored: Scored, believed: Believed) -> Scored:
+        box = self._scene.box(scored.shift_px)
+        theta = None if box is None else distorted(self._scene, box, scored.shift_px, believed)
+        if box is None or theta is None or not np.hypot(*(theta[:2] - scored.shift_px)) < LEFT_PX:
+            return scored
+        off = theta - believed.mean
+        likelihood = self._likelihood(box, theta) - float(off @ believed.precision @ off) / 2
+        return Scored(scored.shift_px, max(likelihood, scored.likelihood))
+
+    def _likelihood(self, box: OverlapBox, theta: Array) -> float:
+        likelihood = 0.0
         for splines, density in self._channels:
             one, two, known = WarpedPair(*splines, box).warped(theta)
             rho = max(_correlated(without_lines(one, known).ravel(), without_lines(two, known).ravel()), 0.0)
             likelihood -= 0.5 * density * known.sum() * np.log1p(-(min(rho, 0.99999) ** 2))
-        return Scored(theta[:2], likelihood)
+        return likelihood
+
+
+def distorted(scene: Scene, box: OverlapBox, shift: Array, believed: Believed) -> Array:
+    """Return theta of the coarse fit from a shift: first the shift alone, then linear map and contrast as well."""
+    pair = WarpedPair(*scene.smooth_splines, box)
+    theta = np.concatenate([shift, np.zeros(COUNT - 2)])
+    theta = least_squares(pair, theta, believed, SHIFT, steps=4)
+    return least_squares(pair, theta, believed, COARSE, steps=4)
+
+
+def _ranked(scored: list[Scored]) -> tuple[Scored, float]:
+    best = max(scored, key=lambda s: s.likelihood)
+    rest = [s.likelihood for s in scored if np.hypot(*(s.shift_px - best.shift_px)) > OTHER_PX]
+    return best, max(rest, default=0.0)
 
 
 def _correlated(one: Array, two: Array) -> float:
