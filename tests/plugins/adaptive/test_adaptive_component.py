@@ -141,6 +141,24 @@ def test_map_follows_a_drift_unless_it_is_switched_off(
     assert ("the map follows it" in caplog.text) is drift
 
 
+def without_neighbours(spectrum: Spectrum) -> float:
+    """Return a value that no neighbour predicts."""
+    assert spectrum.position_m is not None
+    x, y = spectrum.position_m
+    return math.sin(1e12 * x) + math.cos(3e12 * y)
+
+
+def test_map_without_predictable_values_is_logged_to_go_on_as_a_grid(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level("INFO"):
+        run(adaptive("without_neighbours", until={"spectra": 120}), Lab("map"), tmp_path / "s", run_dir=str(tmp_path))
+    assert caplog.text.count("the map goes on as a nested grid") == 1
+    x_m, y_m = (np.array([float(row[f"{axis} [m]"]) for row in table(tmp_path)]) * 1e9 for axis in "xy")
+    # the second lattice, nine times nine positions 125 nm apart, is complete
+    assert sum(x % 125 == 0 and y % 125 == 0 for x, y in zip(x_m.round(), y_m.round(), strict=True)) == 81
+
+
 def test_map_without_any_value_ends_the_component(tmp_path: Path) -> None:
     component = adaptive("height_of_the_right_half", optimizer=f"{HERE}.FromLeft")
     with pytest.raises(MeasurementFailed, match="none of the 3 positions of the map gave a value"):

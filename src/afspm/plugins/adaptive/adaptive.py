@@ -23,6 +23,7 @@ from afspm.plugins.adaptive.mapping import (
     rows,
 )
 from afspm.plugins.adaptive.quantities import QUANTITIES, evaluation
+from afspm.plugins.adaptive.refinement import AdaptiveMap
 
 MOST_LINES: Final = 20
 """Approximate largest number of log lines about the progress of a map."""
@@ -33,10 +34,10 @@ class Adaptive(Component):
 
     A Gaussian process gives the map and its expected error, and follows drift from the values. After a first lattice,
     each spectrum is taken at the position with the largest expected square error per second. No spectrum is taken
-    twice, even if processes are killed.
+    twice, even if processes are killed. Where values can't be predicted from those nearby, it goes on as a nested grid.
 
-    With drift the expected error may be too small, and a map with a limit on `error` ends too early: in two of 32
-    simulated maps the true error was up to 1.5 times as large.
+    The expected error is for another value measured in the region, so it contains the noise of the values: a limit
+    on `error` below the noise is never reached.
 
     The table `map.csv` and the picture `map.png`, also as `map.pdf`, are written into the run folder at the end, from
     at least three spectra.
@@ -58,8 +59,8 @@ class Adaptive(Component):
         coarsest: number of positions along the longer side of the first lattice, 3 to 9.
         levels: number of refinements, 1 to 9, each twice as fine as the last; those after the third are measured only
             between measured positions.
-        drift: whether the map follows a drift of the sample, found from the values; false where it is corrected or far
-            smaller than the finest spacing, since a drift may be found where there is none.
+        drift: whether the map follows a drift of the sample, found from more than 80 values that clearly agree better
+            with it; false where the sample stands still or its drift is corrected elsewhere.
         keep_control: whether to keep control between spectra; by default others may measure meanwhile.
         end_when_done: whether to end the whole experiment after the last spectrum.
         file: name of table and picture, without suffix.
@@ -67,7 +68,7 @@ class Adaptive(Component):
 
     file_suffix: ClassVar[str] = ".csv"
     needs_actions = (names.START_SPEC,)
-    longest_step_s = 120.0  # a process with a thousand measurements takes seconds on a busy computer
+    longest_step_s = 120.0  # a fit with a drift takes seconds on a busy computer
     _outage = OutageLog("the table of the map can't be written", logging.getLogger("afspm.records"))
 
     def __init__(
@@ -110,6 +111,7 @@ class Adaptive(Component):
         self.keep_control, self.end_when_done, self.file = keep_control, end_when_done, file
         self._progress: MapProgress | None = None
         self._velocity = (0.0, 0.0)
+        self._is_grid = False
 
     def planned_work(self, speed_m_s: float | None) -> PlannedWork:
         most = self._until.spectra or MOST_SPECTRA
@@ -196,7 +198,15 @@ class Adaptive(Component):
         if velocity != self._velocity and any(velocity):
             by = " and ".join(quantity(each, "m/s", 2) for each in velocity)
             self.log.info("the values contradict each other less with a drift of %s (x and y): the map follows it", by)
+        elif any(self._velocity) and not any(velocity):
+            self.log.info("the values agree as well without a drift: the map follows none")
         self._velocity = velocity
+        is_grid = isinstance(found.optimizer, AdaptiveMap) and found.optimizer.is_grid
+        if is_grid and not self._is_grid:
+            self.log.info("the values can't be predicted from those nearby: the map goes on as a nested grid")
+        elif self._is_grid and not is_grid:
+            self.log.info("the values can be predicted from those nearby: the map goes on where it is uncertain")
+        self._is_grid = is_grid
         every = max(1, most // MOST_LINES)
         if done and done % every == 0:
             self.log.info("%s", self._state(found))

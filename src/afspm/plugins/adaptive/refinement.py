@@ -6,6 +6,10 @@ and way. The variance is scaled by the local roughness, so even ground is measur
 found only by a measurement nearby, so the candidates reach over the whole region in the third refinement. Those nearer
 to a failure than to a value come last: where one position has no value, the next may have none either.
 
+Each fit judges the process by the values since the fit before. Where their typical error is larger than expected, the
+expected error grows by as much. Where it is about the spread of the values, the process knows no better position than a
+lattice, and the rest of one is measured before it is judged again. Typical is the median, which spots don't shift.
+
 `NestedGrid` has the same process and follows drift alike: a grid with a weaker map would make the comparison look
 better, and show nothing about the choice of positions.
 
@@ -18,7 +22,7 @@ better, and show nothing about the choice of positions.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol, runtime_checkable
 
@@ -27,7 +31,7 @@ import numpy as np
 from afspm.basics import InvalidValue
 from afspm.components import Array
 from afspm.model import Region
-from afspm.plugins.adaptive.gaussian_process import GaussianProcess, Parameters, distances, fitted
+from afspm.plugins.adaptive.gaussian_process import GaussianProcess, Parameters, Places, distances, fitted
 
 Point = Mapping[str, Any]
 Cell = tuple[int, int]
@@ -35,9 +39,17 @@ Cell = tuple[int, int]
 ID: Final = "_id"
 COARSEST: Final = 5  # positions along the longer side of the first lattice
 LEVELS: Final = 6  # number of refinements
+_DRIFT_FROM: Final = 80  # measurements: one of 64 smooth still maps followed a drift by 45 curves, and none by more
 _MORE: Final = 1.2  # times as many measurements as at the last fit
 _REMEMBERED: Final = 60  # latest measurements, from which the costs are learnt
 _CANDIDATES: Final = 3  # refinements of the candidates everywhere: 33 x 33 positions with a first lattice of 5 x 5
+_PREDICTED: Final = 40  # latest predictions, which judge the process
+_LEAST_PREDICTED: Final = 25
+# of the variance of the values: on maps with a larger typical error of the predictions the adaptive choice was up to
+# 14 % worse than a grid. A spotty map has large errors at its spots alone
+_UNEXPLAINED: Final = 0.8
+_JUDGED_FROM: Final = 50  # measurements
+_TIED: Final = 1e-9  # relative difference of two gains by rounding
 _LEAST_S: Final = 1e-9  # a learnt cost may be of ways alone, and a way zero
 
 
@@ -133,6 +145,15 @@ class NestedLattices:
         rows = {cell[1] - cell[1] % coarse, cell[1] + -cell[1] % coarse}
         return [(i, j) for i in columns for j in rows]
 
+    def around(self, cell: Cell, level: int) -> list[Cell]:
+        """Return the neighbours of a cell in a finer level."""
+        stride = self.stride(level)
+        sides = [[at + side for side in (-stride, 0, stride)] for at in cell]
+        return [
+            (i, j) for j in sides[1] for i in sides[0]
+            if (i, j) != cell and 0 <= i < self.counts[0] and 0 <= j < self.counts[1]
+        ]  # fmt: skip
+
     def xy_m(self, cells: Iterable[Cell]) -> Array:
         """Return the positions of cells, shape (n, 2), in m."""
         at = np.array(list(cells), dtype=np.float64).reshape(-1, 2)
@@ -172,7 +193,7 @@ class LatticeMap:
         self.cost = MeasurementCost()
         self._follows_drift = velocity_m_s is None
         self._fitted = 0
-        self._done: set[Cell] = set()
+        self._done: dict[Cell, None] = {}  # measured and failed, in their order
         self._failed: list[Cell] = []
         self._asked: dict[str, Cell] = {}
         self._queue: list[Cell] = []
@@ -180,6 +201,7 @@ class LatticeMap:
         self._ways_m: list[float] = []
         self._seconds: list[float] = []
         self._model: GaussianProcess | None = None
+        self._predictions: list[tuple[float, float]] = []  # squares of the errors, and their expected squares
         self._check = self.lattice.xy_m(self.lattice.cells(min(3, levels)))
 
     # -- the protocol
@@ -215,20 +237,19 @@ class LatticeMap:
         rows = [self._row(point) for point in points]
         for point, row in zip(points, rows, strict=True):
             if ID in point:
-                self._done.add(self._cell(point[ID]))
+                self._done[self._cell(point[ID])] = None
                 self._asked.pop(str(point[ID]), None)
             if self._rows and "seconds" in point:
                 self._ways_m.append(math.dist(row[:2], self._rows[-1][:2]))
                 self._seconds.append(float(point["seconds"]))
             self._rows.append(row)
-        self._model = None
         self.cost = learnt_cost(self._ways_m, self._seconds)
 
     def register_failures(self, suggestions: Sequence[Point]) -> None:
         """Leave out suggested positions that can't be measured."""
         for point in suggestions:
             cell = self._cell(point[ID])
-            self._done.add(cell)
+            self._done[cell] = None
             self._failed.append(cell)
             self._asked.pop(str(point[ID]), None)
 
@@ -254,21 +275,28 @@ class LatticeMap:
     @property
     def model(self) -> GaussianProcess:
         """The process after all measurements, with the parameters fitted last."""
-        if self._model is None:
-            x, y, values, times = self.measurements.T
-            self._model = GaussianProcess(np.stack([x, y], axis=1), values, times, self.parameters)
-        return self._model
+        model = self._model
+        known = 0 if model is None else len(model.positions_m)
+        if model is not None and known == len(self._rows):
+            return model
+        x, y, values, times = self.measurements[known:].T
+        if model is None:
+            self._model = model = GaussianProcess(np.stack([x, y], axis=1), values, times, self.parameters)
+        else:
+            model.add(np.stack([x, y], axis=1), values, times)
+        return model
 
     def fit(self) -> None:
         """Fit the process to all measurements, if their number has grown by a fifth since the last fit."""
         if len(self._rows) < _MORE * self._fitted:
             return
+        self._judge_predictions()
         self._fitted = len(self._rows)
         x, y, values, times = self.measurements.T
         shortest = 0.3 * self._reached_m()
         self.parameters = fitted(
             np.stack([x, y], axis=1), values, times, self.parameters, shortest,
-            drifts=self._follows_drift and len(values) > 40,
+            drifts=self._follows_drift and len(values) > _DRIFT_FROM,
         )  # fmt: skip
         self._model = None
 
@@ -277,10 +305,34 @@ class LatticeMap:
         return self.model.predict(xy_m)
 
     def expected_error(self) -> float:
-        """Return the expected rms error of the map over the region."""
-        return math.sqrt(float(self.model.variance(self._check).mean()))
+        """Return the expected rms difference between the map and a value measured anywhere in the region.
+
+        It contains the noise of the values, since noise looks like features between the measurements. It is enlarged
+        where the values since were typically farther from their predictions than expected.
+        """
+        scale = 1.0
+        if len(self._predictions) >= _LEAST_PREDICTED:
+            square, expected = self._judged()
+            scale = max(1.0, _typical(square / expected))
+        return math.sqrt(scale * (float(self.model.variance(self._check).mean()) + self.model.noise_variance))
 
     # -- inside
+
+    def _judge_predictions(self) -> None:
+        # the measurements since the last fit, as the process of then predicts them
+        if not self._fitted:
+            return
+        x, y, values, times = self.measurements.T
+        at_m, known = np.stack([x, y], axis=1), slice(self._fitted)
+        before = GaussianProcess(at_m[known], values[known], times[known], self.parameters)
+        since = slice(self._fitted, None)
+        now_m = before.on_sample(at_m[since], times[since])
+        square = (values[since] - before.predict(now_m)) ** 2
+        expected = before.variance(now_m) + before.noise_variance
+        self._predictions += zip(square.tolist(), expected.tolist(), strict=True)
+
+    def _judged(self) -> Array:
+        return np.array(self._predictions[-_PREDICTED:]).T
 
     def _round(self) -> list[Cell]:
         raise NotImplementedError
@@ -292,11 +344,8 @@ class LatticeMap:
                 return snake(cells)
         return []
 
-    def _reached(self, done: Set[Cell]) -> int:
-        return max((self.lattice.level(cell) for cell in done), default=0)
-
     def _reached_m(self) -> float:
-        return self.lattice.spacing_m(self._reached(self._done))
+        return self.lattice.spacing_m(max(map(self.lattice.level, self._done), default=0))
 
     def _at_m(self) -> Array:
         return np.array(self._rows[-1][:2]) if self._rows else self.lattice.xy_m([(0, 0)])[0]
@@ -332,6 +381,11 @@ class LatticeMap:
         return row
 
 
+def _typical(squares: Array) -> float:
+    # the variance of normal errors with this median square: a few large errors leave it as it is
+    return float(np.median(squares)) / 0.455
+
+
 class NestedGrid(LatticeMap):
     """Complete nested lattices, one after the other, each back and forth row by row."""
 
@@ -345,7 +399,19 @@ class AdaptiveMap(LatticeMap):
     """Positions with the largest expected square error per second.
 
     The candidates are the positions of the third refinement, and of finer ones between positions that are measured.
+    Where the latest values were typically predicted no better than by their mean, the rest of a lattice is measured.
+
+    Attributes:
+        is_grid: whether the positions are those of a lattice, since the values could not be predicted.
     """
+
+    def __init__(self, region: Region, quantity: str, **settings: Any) -> None:
+        super().__init__(region, quantity, **settings)
+        self.is_grid = False
+        self._coarse = min(_CANDIDATES, self.lattice.levels)
+        self._cells = self.lattice.cells(self._coarse)  # candidates, with those measured since the last fit
+        self._places: Places | None = None
+        self._followed = 0  # measured cells whose neighbours are candidates
 
     def _round(self) -> list[Cell]:
         first = [cell for cell in self.lattice.cells(0) if cell not in self._done]
@@ -354,28 +420,49 @@ class AdaptiveMap(LatticeMap):
         if not self._rows:  # no position of the first lattice has a value
             return self._rest_of_lattice()
         self.fit()
-        cells = self._candidates()
-        if not cells:
+        self.is_grid = self._is_unpredictable()
+        if self.is_grid:
+            return self._rest_of_lattice()
+        places = self._candidates()
+        is_left = np.array([cell not in self._done for cell in self._cells])
+        if not is_left.any():
             return []
-        xy = self.lattice.xy_m(cells)
+        # on the sample, as the candidates: with drift the tip's own position is another
+        ways_m = np.hypot(*(places.xy_m - self.model.positions_m[-1]).T)
+        gains = places.variance() / np.maximum(self.cost.fixed_s + self.cost.per_m_s * ways_m, _LEAST_S)
         if self._failed:
             # the expected error stays large around a failure, where all other positions may fail, too
-            failure_m = distances(xy, self.lattice.xy_m(self._failed)).min(axis=1)
-            likely = distances(xy, self.model.positions_m).min(axis=1) < failure_m
-            if likely.any():
-                cells, xy = [cell for cell, kept in zip(cells, likely, strict=True) if kept], xy[likely]
-        # on the sample, as the candidates: with drift the tip's own position is another
-        ways_m = np.hypot(*(xy - self.model.positions_m[-1]).T)
-        seconds = np.maximum(self.cost.fixed_s + self.cost.per_m_s * ways_m, _LEAST_S)
-        return [cells[int(np.argmax(self.model.variance(xy) / seconds))]]
+            failure_m = distances(places.xy_m, self.lattice.xy_m(self._failed)).min(axis=1)
+            is_likely = is_left & (places.nearest_m.min(axis=1) < failure_m)
+            is_left = is_likely if is_likely.any() else is_left
+        gains[~is_left] = -1.0
+        # symmetric positions differ by rounding alone, which may be another one after a restart
+        tied = np.flatnonzero(gains >= gains.max() * (1.0 - _TIED))
+        return [min((self._cells[place] for place in tied), key=self._order)]
 
-    def _candidates(self) -> list[Cell]:
-        coarse = min(_CANDIDATES, self.lattice.levels)
-        cells = [cell for cell in self.lattice.cells(coarse) if cell not in self._done]
-        for level in range(coarse + 1, min(self._reached(self._done) + 1, self.lattice.levels) + 1):
-            cells += [
-                cell
-                for cell in self.lattice.new(level)
-                if cell not in self._done and self._done.issuperset(self.lattice.parents(cell, level))
-            ]
-        return cells
+    def _is_unpredictable(self) -> bool:
+        if len(self._rows) < _JUDGED_FROM or len(self._predictions) < _LEAST_PREDICTED:
+            return False
+        return _typical(self._judged()[0]) > _UNEXPLAINED * float(np.var(self.measurements[:, 2]))
+
+    def _candidates(self) -> Places:
+        model = self.model
+        opened = [cell for done in list(self._done)[self._followed :] for cell in self._opened_by(done)]
+        self._followed = len(self._done)
+        if self._places is None or self._places.model is not model:
+            self._cells = [cell for cell in dict.fromkeys([*self._cells, *opened]) if cell not in self._done]
+            self._places = Places(model, self.lattice.xy_m(self._cells))
+        elif added := [cell for cell in dict.fromkeys(opened) if cell not in self._done]:
+            self._cells += added
+            self._places.add(self.lattice.xy_m(added))
+        return self._places
+
+    def _opened_by(self, done: Cell) -> Iterator[Cell]:
+        # the finer cells around a measured one whose parents are all measured
+        for level in range(max(self._coarse, self.lattice.level(done)) + 1, self.lattice.levels + 1):
+            for cell in self.lattice.around(done, level):
+                if all(parent in self._done for parent in self.lattice.parents(cell, level)):
+                    yield cell
+
+    def _order(self, cell: Cell) -> tuple[int, int, int]:
+        return max(self._coarse, self.lattice.level(cell)), cell[1], cell[0]
