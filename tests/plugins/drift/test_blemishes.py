@@ -1,4 +1,4 @@
-"""Scars and spikes in only one of two scans, and lines of a rotated scan: they don't reach the fit."""
+"""Blemishes in one of two scans, lines of a rotated scan, features of a pixel: effects on fit and ellipses."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_crossing_lines_are_removed_with_the_rows() -> None:
 
 def test_doubt_of_a_match_is_limited_to_the_range_of_the_fit() -> None:
     blocks = np.eye(COUNT)
-    certain, small = Doubt(1.0, 1.0, 0.01, 0.1, blocks), Doubt(1e4, 1e3, 3.0, 1.0, blocks)
+    certain, small = Doubt(1.0, 1.0, 0.01, 0.1, blocks, 0.0), Doubt(1e4, 1e3, 3.0, 1.0, blocks, 0.0)
     assert certain.spread_of_evidence == pytest.approx(SPREAD["all"])
     assert small.spread_of_evidence == pytest.approx(SPREAD["most"])
 
@@ -163,3 +163,11 @@ def test_lines_of_a_zoom_creep_for_their_own_pixels() -> None:
     assert abs(crept((1.0, 1.0))[1]) > 0.5
     assert abs(crept((1.0, 0.1))[1]) < 0.02
     assert crept((0.0, 0.0)) == pytest.approx(np.zeros(20))
+
+
+def test_ellipses_hold_the_errors_of_pictures_with_features_of_a_pixel() -> None:
+    pairs = [foreign_pair("wander0.0", surface, seed) for surface in ("particles", "steps") for seed in range(60, 64)]
+    found = [LeastSquares().register(one.reference, one.scan) for one in pairs]
+    off_m = [one.displacement_m - pair.displacement_m(one.center_m) for one, pair in zip(found, pairs, strict=True)]
+    chi2 = [off @ np.linalg.solve(one.covariance_m2, off) for one, off in zip(found, off_m, strict=True)]
+    assert 0.1 < np.mean(chi2) / 2 < 2.0

@@ -160,7 +160,7 @@ def _fine(
     pair = WarpedPair(*scene.splines(values), inner, theta[:2], lines.own_px, lines.crossing(inner, theta[:2]))
     believed = _believed(expected or ExpectedShift(theta[:2], FARTHEST_PX**2 * np.eye(2)))
     fit = generalised_least_squares(pair, theta, believed, fine)
-    model, doubt = covariance(fit, believed)
+    model, doubt = covariance(fit, believed, fine.sharpness)
     seen = LinearSeen(fit.theta[LINEAR].reshape(2, 2), doubt.linear(model))
     information, pull = (each / DISTRUST for each in fit.information(believed))
     free = believed.precision.copy()

@@ -16,6 +16,7 @@ from afspm.components import Array
 Real = TypeVar("Real", np.float32, np.float64)
 
 MEDIAN_POWER = 0.4549  # median of the square of a normal value of unit variance
+TOP = 0.35  # cycles per pixel: the upper half of the top octave
 BLUR_PX = 0.45  # removes frequencies that interpolation would alias
 
 
@@ -39,10 +40,13 @@ class FineFilter:
     Attributes:
         frequency: frequencies in cycles per pixel, ascending.
         gain: sqrt(2 S / (2 S + N)) at each frequency.
+        sharpness: share of the gradients, as power, in the upper half of the top octave; 1 for features of single
+            pixels.
     """
 
     frequency: Array
     gain: Array
+    sharpness: float
 
     @classmethod
     def of(cls, first: Array, second: Array) -> FineFilter:
@@ -55,11 +59,14 @@ class FineFilter:
         width = max(1.0 / min(*first.shape, *second.shape), 1.0 / 64)
         index = (length / width).astype(np.intp)
         power = np.bincount(index, squares) / np.maximum(np.bincount(index), 1)
-        floor = float(np.median(squares[length > 0.35])) / MEDIAN_POWER
+        floor = float(np.median(squares[length > TOP])) / MEDIAN_POWER
         signal = np.maximum(power - floor, 0.0)
+        frequency = (np.arange(power.size) + 0.5) * width
+        gradients = np.where(frequency < 0.5, signal * np.bincount(index) * frequency**2, 0.0)
+        sharpness = float(gradients[frequency > TOP].sum() / max(gradients.sum(), 1e-300))
         signal[: np.argmax(signal)] = signal.max()
         gain = np.sqrt(2.0 * signal / (2.0 * signal + floor + 1e-300))
-        return cls((np.arange(power.size) + 0.5) * width, gain)
+        return cls(frequency, gain, sharpness)
 
     def at(self, frequency: Array) -> Array:
         h: Array = np.interp(frequency, self.frequency, self.gain) * np.exp(-2.0 * (np.pi * frequency * BLUR_PX) ** 2)
