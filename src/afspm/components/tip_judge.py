@@ -31,7 +31,14 @@ import numpy as np
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.basics.formatting import area_text
 from afspm.basics.plain_data import Plain
-from afspm.components.tip_metrics import LEAST_CONTRAST, TipMetrics, autocorrelation, metrics, slopes
+from afspm.components.tip_metrics import (
+    LEAST_CONTRAST,
+    TipMetrics,
+    autocorrelation,
+    metrics,
+    share_at_ends,
+    slopes,
+)
 from afspm.model import Region
 from afspm.model.arrays import Array, robust_spread
 from afspm.model.snapshot import from_plain, to_plain
@@ -47,6 +54,7 @@ FOLLOW = 0.25  # least weight of a new good scan in the means of its place
 LEVEL_NOISES = 3.0  # standard deviations between stretches of a line, with a good tip
 NOISIER = 2.0  # times the usual noise, above which only unrest shows that a tip is bad
 UNCERTAIN = 0.99  # of the way to a limit
+FEWEST_AT_END = 0.005  # share of the pixels at the highest or lowest value of a scan that ends at its range
 FLOORS = TipMetrics(detail=0.02, ghost=0.01, unrest_m=0.15, contrast=0.0)  # least spreads: few scans underestimate them
 Fault = tuple[float, str, str]
 """A fault: its size relative to the limit for a bad scan (1), the flaw, and the reason."""
@@ -273,7 +281,7 @@ class TipJudge:
             return Verdict(Opinion.UNCLEAR, why, measured)
         if not self._is_known(kind):
             return self._learn(kind, place, measured, correlation, region)
-        verdict = self._compare(kind, place, measured)
+        verdict = self._compare(kind, place, measured, at_end=share_at_ends(trace))
         self._state.doubtful = verdict.opinion is not Opinion.GOOD
         if verdict.opinion is Opinion.GOOD:
             kind.note(place, region, measured, correlation)
@@ -320,7 +328,9 @@ class TipJudge:
             Opinion.LEARNING, f"reference {len(reference.first)} of {self.reference_scans} of {of}", measured
         )
 
-    def _compare(self, reference: TipReference, place: KnownPlace | None, measured: TipMetrics) -> Verdict:
+    def _compare(
+        self, reference: TipReference, place: KnownPlace | None, measured: TipMetrics, *, at_end: float
+    ) -> Verdict:
         faults = self._faults_anywhere(reference, measured)
         usual = reference.usual_anywhere()
         if place is not None:
@@ -328,10 +338,9 @@ class TipJudge:
             usual = place.usual
         noisier = _relative(measured, usual).noise_m
         if noisier > NOISIER:  # strong noise changes the other metrics, too
-            faults = [
-                (way if flaw == CONTAMINATED else min(way, UNCERTAIN), flaw, f"{why} in {noisier:.1f} times the noise")
-                for way, flaw, why in faults
-            ]
+            faults = _uncertain(faults, f"in {noisier:.1f} times the noise")
+        if at_end > FEWEST_AT_END:  # the same cut through all features looks like a ghost, or as lost detail
+            faults = _uncertain(faults, f"with {at_end:.1%} of the pixels at the end of the range of heights")
         worst = max(way for way, _, _ in faults)
         if worst >= 1.0:
             reference.suspect = reference.suspect or place is not None
@@ -383,6 +392,12 @@ class TipJudge:
         ]
 
 
+def _uncertain(faults: list[Fault], why_not: str) -> list[Fault]:
+    return [
+        (way if flaw == CONTAMINATED else min(way, UNCERTAIN), flaw, f"{why} {why_not}") for way, flaw, why in faults
+    ]
+
+
 class VerdictCounter:
     """A counter of opinions: several bad opinions in a row set the flag, several good opinions clear it."""
 
@@ -417,7 +432,9 @@ def _relative(measured: TipMetrics, usual: TipMetrics) -> TipMetrics:
     own = LEVEL_NOISES * usual.noise_m
     unrest = (measured.unrest_m + own) / (usual.unrest_m + own) if own > 0 else 1.0
     noise = measured.noise_m / usual.noise_m if usual.noise_m > 0 else 1.0
-    detail = measured.detail / usual.detail if usual.detail > 0 else 1.0
+    # without fine detail above the noise, as on some lattices, its power is noise
+    fine = usual.contrast * usual.detail / (1.0 + usual.detail)
+    detail = measured.detail / usual.detail if fine > LEAST_CONTRAST else 1.0
     return TipMetrics(detail, measured.ghost, unrest, measured.contrast, noise)
 
 

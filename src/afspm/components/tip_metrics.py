@@ -92,6 +92,16 @@ def slopes(trace: Array, retrace: Array | None = None) -> Slopes:
     return Slopes(_clipped(np.diff(level, axis=1)), _clipped(np.diff(back, axis=1)), level - back)
 
 
+def share_at_ends(heights: Array) -> float:
+    """Return the share of the pixels at the highest or the lowest value of a scan, whichever is larger.
+
+    Rows of one value are left out: some controllers fill lost rows with zeros.
+    """
+    rows = heights[np.isfinite(heights).all(axis=1)]
+    rows = rows[np.ptp(rows, axis=1) > 0.0]
+    return float(max((rows == end).mean() for end in (rows.min(), rows.max()))) if rows.size else 0.0
+
+
 def autocorrelation(of: Slopes, reach_px: int) -> Array:
     """Return the autocorrelation of the slopes, 1 at the peak near zero lag.
 

@@ -256,12 +256,32 @@ def test_missing_rows_of_a_reference_are_interpolated() -> None:
     np.testing.assert_array_equal(template.heights[0], template.heights[1])
 
 
+def pair_of(size: float) -> PairStatistics:
+    return PairStatistics(flat_m=size, per_slope=0.1, usual=0.1, spread=0.1, highest=20.0 * size, noise=1.0)
+
+
 def test_few_pairs_are_judged_by_the_least_alike_one() -> None:
-    alike, unlike = (
-        PairStatistics(flat_m=one, per_slope=0.1, usual=one, spread=0.1, highest=1.0, noise=1.0) for one in (1.0, 2.0)
-    )
+    alike, unlike = pair_of(1.0), pair_of(2.0)
     assert LineStatistic([alike, alike, unlike]).flat_m == 2.0
     assert LineStatistic([alike, alike, alike, unlike]).flat_m == 1.0
+
+
+def test_pair_of_scans_with_a_change_between_them_is_no_measure_of_good_scans() -> None:
+    for pairs in ([pair_of(1.0), pair_of(3.0)], [pair_of(3.0), pair_of(1.0), pair_of(1.0)]):
+        statistic = LineStatistic(pairs)
+        assert (statistic.flat_m, statistic.threshold) == (1.0, 40.0)
+
+
+def test_scan_unlike_the_earlier_ones_all_along_keeps_the_threshold_within_reach() -> None:
+    random, pictures = np.random.default_rng(8), [heights(picture) for picture in night()[:LEARNT]]
+    common = USUAL_M * random.standard_normal(pictures[0][0].shape)
+    judge = LineJudge()
+    for number, picture in enumerate(pictures):
+        unlike = [values + common * (number == LEARNT - 1) for values in picture]
+        judge.learn(unlike, HOME, KIND, number * PERIOD_S)
+    running = judge.begin(HOME, KIND, LEARNT * PERIOD_S, channels=2)
+    assert running is not None
+    assert running.threshold < 100.0, "twenty lines reach no more"
 
 
 def test_tip_that_spoils_some_lines_is_no_jump() -> None:
@@ -328,14 +348,14 @@ def test_three_times_the_noise_is_looked_at_within_twenty_rows(channels: int) ->
     assert "the noise is" in alarm.why
 
 
-@pytest.mark.parametrize("channels", [1, 2])
-def test_streaks_are_looked_at_within_twenty_rows(channels: int) -> None:
+@pytest.mark.parametrize(("longest", "channels"), [(20, 1), (20, 2), (45, 2)])
+def test_streaks_are_looked_at_within_twenty_rows(longest: int, channels: int) -> None:
     random = np.random.default_rng(5)
     streaked = heights(night()[LEARNT])
     for values in streaked:
         for row in CHANGED_ROW + np.nonzero(random.random(ROWS - CHANGED_ROW) < 0.6)[0]:
             first = int(random.integers(ROWS - 10))
-            values[row, first : first + int(random.integers(8, 20))] += 15.0 * USUAL_M
+            values[row, first : first + int(random.integers(longest - 12, longest))] += 15.0 * USUAL_M
     (alarm,) = looks(streaked, channels)
     assert alarm.level is AlarmLevel.LOOK
     assert CHANGED_ROW <= alarm.row <= CHANGED_ROW + 20

@@ -88,6 +88,8 @@ def disturbed(pair: tuple[Scan, Scan], what: str) -> tuple[np.ndarray, np.ndarra
         elif what == "zero rows":  # of a tilted sample, in which a row of zeros is a ramp
             values += 50e-9 * np.linspace(-1.0, 1.0, PIXELS)
             values[random.permutation(PIXELS)[:9]] = 0.0
+        elif what == "the end of the range":
+            np.minimum(values, np.quantile(both[0], 0.95), out=values)
         else:
             for row in range(PIXELS):
                 if random.random() < 0.6:
@@ -96,8 +98,8 @@ def disturbed(pair: tuple[Scan, Scan], what: str) -> tuple[np.ndarray, np.ndarra
     return both[0], both[1]
 
 
-@pytest.mark.parametrize("what", ["hum", "noise", "zero rows"])
-def test_noise_hum_and_lost_rows_are_no_bad_tip(what: str) -> None:
+@pytest.mark.parametrize("what", ["hum", "noise", "zero rows", "the end of the range"])
+def test_noise_hum_lost_rows_and_cut_heights_are_no_bad_tip(what: str) -> None:
     judge, good, _ = learnt(1, "double")
     verdict = judge.judge(*disturbed(good[0], what), HOME)
     assert verdict.opinion is not Opinion.BAD, verdict.why
@@ -134,6 +136,18 @@ def test_a_sample_so_smooth_that_its_first_scans_had_no_fine_detail_is_judged_by
         seen["detail"] = 0.0
     judge.restore(state)
     assert judged(judge, left[0]).opinion is Opinion.GOOD
+
+
+def test_fine_detail_below_the_noise_is_no_measure_of_the_tip() -> None:
+    judge, left, _ = learnt(1, "blunt")
+    state = judge.state()
+    (kind,) = state["kinds"]
+    detail = 3.0 * kind["first"][0]["detail"]
+    for contrast, expected in ((100.0, Opinion.BAD), (0.1, Opinion.GOOD)):
+        for seen in (*kind["first"], *(place["usual"] for place in kind["places"])):
+            seen["detail"], seen["contrast"] = detail, contrast
+        judge.restore(state)
+        assert judged(judge, left[0]).opinion is expected
 
 
 def test_double_tip_is_detected_without_retrace() -> None:

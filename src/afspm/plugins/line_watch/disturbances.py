@@ -1,7 +1,8 @@
 """Detection of strong noise and of streaks, as of a dirty tip, in what trace and retrace don't share. Pure.
 
-Noise is strong if most frequencies have several times their usual power: a hum fills few. A line has a streak if a part
-of it lies beside the rest, far outside of the line's own spread, which a hum is not.
+Noise is strong if most frequencies have several times their usual power: a hum fills few. A line has a streak if it
+steps up or down far beyond the changes in the rest of the line. A hum changes as much everywhere. A streak that covers
+half of the line widens the spread of its heights, but not of its changes.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from afspm.plugins.line_watch.registration import RowFit
 NEWEST = 10  # lines with strong noise
 NOISIER = 2.0  # times the usual standard deviation: a row less its template has both noises, so noise x 3 is x 2.2
 STREAKED, OF_LINES = 5, 16  # lines: a scar now and then is none
-SMOOTH_PX = 5
-BESIDE = 5.0  # times the line's own spread, and at least
-LEAST = 3.0  # times the usual standard deviation
+SIDE_PX, LEAST_SIDES = 8, 16  # on each side of a step: the shortest streak; fewer in a short line
+BEYOND = 5.0  # times the spread of the line's own changes, and at least
+LEAST = 2.5  # times the usual standard deviation: five spreads of such a change in white noise
 
 
 class Disturbances:
@@ -53,6 +54,8 @@ class Disturbances:
 
 
 def _is_streaked(noise: Array) -> bool:
-    smooth = np.convolve(noise, np.full(SMOOTH_PX, 1.0 / SMOOTH_PX), mode="valid")
-    off = np.abs(smooth - np.median(smooth))
-    return bool(off.max() > max(LEAST, BESIDE * SD_PER_MAD * float(np.median(off))))
+    side = max(1, min(SIDE_PX, noise.size // LEAST_SIDES))
+    sums = np.append(0.0, np.cumsum(noise))
+    means = (sums[side:] - sums[:-side]) / side
+    steps = np.abs(means[side:] - means[:-side])
+    return bool(steps.size and steps.max() > max(LEAST, BEYOND * SD_PER_MAD * float(np.median(steps))))

@@ -52,6 +52,10 @@ from afspm.plugins.line_watch.registration import (
 GOOD_DECAY = 5.0  # decay, with the evidence, of the share of good scans that reach it: assumed, not fitted
 FEWEST_PAIRS = 2  # least number of pairs of good scans before scans of their kind are judged
 ENOUGH_PAIRS = 4  # least number of pairs for medians
+# Times the least of few pairs, in the size of the image's part: a pair above it crosses a change between its scans, as
+# if a feedback begins to overshoot, and is no measure of good scans. Of ten nights with unlike pairs, three had one of
+# 9 to 38 times, the others of at most 2.5 times.
+ODD_PAIR = 5.0
 KEPT_PAIRS, KEPT_SPEEDS = 16, 3
 MOST_KINDS, MOST_PLACES = 4, 8
 SAME_SIZE = 0.02  # relative difference of sizes, and of angles in rad, within which they count as equal
@@ -91,9 +95,12 @@ class JudgeSettings:
     look: float = 0.6  # share of the threshold above which a person should look
     # number and width, relative to the line, of parts that a changed sample may fill
     parts: tuple[tuple[int, float], ...] = ((1, 1 / 4), (2, 1 / 8))
-    elsewhere: float = 0.4  # share of the threshold that the rest of the lines must reach before a scan is stopped
-    # share of the sum that another cause than the tip may leave, if that is more than `elsewhere`; each of 9 changed
-    # tips left a third or more
+    # share of the threshold that the rest of the lines must reach before a scan is stopped. New adatoms and dragged
+    # particles reached 0.06, two tips that change at few steps and scratches 0.3.
+    elsewhere: float = 0.25
+    unexplained: float = 0.4  # share of the threshold that another cause than the tip may leave
+    # share of the sum that another cause may leave, if that is more than `unexplained`; each of 9 changed tips left a
+    # third or more
     left: float = 0.25
     # share of the rows for which a sum grows before the change counts as the tip's, and not as a single adsorbate's.
     # Without this rule a double tip among few particles in 64 rows never stopped a scan.
@@ -182,6 +189,11 @@ class PairStatistics:
     spread: float
     highest: float
     noise: float
+
+    @property
+    def size_m2(self) -> float:
+        """Mean square of the image's part that a good line may reach."""
+        return (max(0.0, self.usual) + 2.0 * self.spread) * self.flat_m**2
 
 
 @dataclass
@@ -300,6 +312,9 @@ class LineStatistic:
     """
 
     def __init__(self, pairs: Sequence[PairStatistics]) -> None:
+        if len(pairs) < ENOUGH_PAIRS:
+            most_m2 = ODD_PAIR * min(pair.size_m2 for pair in pairs)
+            pairs = [pair for pair in pairs if pair.size_m2 <= most_m2]
         # for few pairs the largest values: their median may lie well below the values of the next pair
         middle = np.median if len(pairs) >= ENOUGH_PAIRS else np.max
         self.flat_m, self.per_slope, self._usual, self._spread = (
@@ -541,7 +556,7 @@ class ScanJudge:
         for number, fits in enumerate(compared):
             cusum.add(number, self._sigmas(fits))
             highest = max(highest, cusum.value)
-        little = max(FITTED.elsewhere * self.threshold, FITTED.left * self._cusum.value)
+        little = max(FITTED.unexplained * self.threshold, FITTED.left * self._cusum.value)
         return 2 * len(compared) > len(lines) and highest < little
 
     def _differ(self, lines: Sequence[tuple[int, Sequence[Array]]], where: NDArray[np.bool_]) -> bool:
@@ -860,14 +875,27 @@ def _statistics(
     spread = max(float(np.quantile(own, 0.84)) - usual, FITTED.least_spread)
     pair = PairStatistics(flat_m, per_slope, usual, spread, 0.0, float(np.median(noise)))
     # judged by the other pairs, as a running scan is
-    statistic, cusum, highest = LineStatistic(before or [pair]), Cusum(), 0.0
-    filtering = NoiseFilter(statistic.flat_m, statistic.per_slope)
+    highest = _highest(LineStatistic(before or [pair]), fitted, comparer, odd)
+    if before and highest > FITTED.floor:
+        # a pair that differs all along raises the usual difference: only its excess over that counts as a sum
+        highest = min(highest, max(FITTED.floor, _highest(LineStatistic([*before, pair]), fitted, comparer)))
+    return replace(pair, highest=highest)
+
+
+def _highest(
+    statistic: LineStatistic,
+    fitted: Sequence[tuple[int, list[RowFit]]],
+    comparer: _Comparer,
+    odd: _OddRows | None = None,
+) -> float:
+    cusum, highest, filtering = Cusum(), 0.0, NoiseFilter(statistic.flat_m, statistic.per_slope)
     for row, fits in fitted:
         sigmas = statistic.sigmas(filtering.add(fits))
-        odd.note(row, fits[: len(comparer.place.templates)], statistic, sigmas)
+        if odd is not None:
+            odd.note(row, fits[: len(comparer.place.templates)], statistic, sigmas)
         cusum.add(row, sigmas)
         highest = max(highest, cusum.value)
-    return replace(pair, highest=highest)
+    return highest
 
 
 def _expected(fits: Sequence[RowFit]) -> tuple[float, float]:
