@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from afspm.model import Region
+from afspm.plugins.drift.doubt.covariance import mean_over_rows
 from afspm.plugins.drift.doubt.nuisances import Shear, averaged
 from afspm.plugins.drift.estimators.least_squares import LeastSquares
 from afspm.plugins.drift.pairs.images import without_scars
@@ -120,6 +121,35 @@ def test_a_difference_of_velocities_does_not_apply_to_scans_taken_differently(
     mean, sd = shear_by_drift(known, reference, scan)
     assert (mean == 0.0).all()
     assert sd is None
+
+
+def fit_of_blocks(moved_px: NDArray[np.float64], information: NDArray[np.float64]) -> tuple[Fit, float]:
+    """Return a fit of blocks of rows with these displacements along x, and its shift, the mean by information."""
+    shift = float(np.average(moved_px, weights=information))
+    curvature = information[:, None, None] * np.eye(COUNT)
+    theta = np.zeros(COUNT)
+    theta[0] = shift
+    slope = information[:, None] * np.where(np.arange(COUNT) == 0, shift - moved_px[:, None], 0.0)
+    return Fit(theta, curvature, curvature, slope), shift
+
+
+def test_the_displacement_is_the_mean_over_rows_and_not_over_features() -> None:
+    moved_px, information = np.array([0.0, 0.1, 0.3, 0.6]), np.array([1e6, 2e6, 5e6, 1e4])
+    fit, shift = fit_of_blocks(moved_px, information)
+    assert abs(shift - 0.25) > 0.03
+    assert mean_over_rows(fit) == pytest.approx([0.25 - shift, 0.0], abs=2e-3)
+
+
+def test_rows_without_features_do_not_move_the_mean() -> None:
+    fit, _ = fit_of_blocks(np.array([0.0, 0.02, -0.02, 30.0]), np.array([1e6, 1e6, 1e6, 1e-3]))
+    assert np.abs(mean_over_rows(fit)).max() < 1e-3
+
+
+def test_rows_that_move_alike_leave_the_shift_as_it_is() -> None:
+    random = np.random.default_rng(1)
+    information = 10.0 ** random.uniform(2.0, 4.0, 16)
+    fit, _ = fit_of_blocks(random.standard_normal(16) / np.sqrt(information), information)
+    assert np.abs(mean_over_rows(fit)).max() < 0.5 / np.sqrt(information.sum())
 
 
 def told(shift: float, shear: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

@@ -2,9 +2,9 @@
 
 The covariance of a shift is of the mean displacement of the sample under the tip over the rows of the overlap, during
 these two frames: not of the sample between two times. Lines wander (vibration, hysteresis, creep, thermal motion), and
-their mean over a frame moves the whole picture as drift does. No pair of scans can tell one from the other, so the mean
-counts as displacement, and a tracker adds what its models of motion say of it. The error is how differently the shift
-weighs the rows. So the covariance does not depend on the spectrum of the wander, below or above a frame.
+their mean over a frame moves the whole picture as drift does. No pair of scans can tell one from the other. So the mean
+counts as displacement (`mean_over_rows`), and a tracker adds what its models of motion say of it. The covariance thus
+does not depend on the spectrum of the wander, below or above a frame.
 """
 
 from __future__ import annotations
@@ -34,13 +34,8 @@ LAGS = 2
 
 With blocks of 16 rows as independent ones, pairs whose lines wander by 0.2 px over 16 rows had three times the variance
 that was given."""
-OF_MODEL, OF_BLOCKS, BY_LEVERAGE = 3.0, 2.0, 0.8
-"""Factors on both parts of a shift's covariance, and exponent of `leverage`: chosen on pairs of three programs.
-
-The likelihood of the errors is largest with 0.3 to 0.5 for `OF_BLOCKS`, but then ellipses of 95 % hold 36 to 80 % of
-the pairs of another program whose lines wander in one axis, or relax; with 1.2 they hold 64 to 93 %, and with 2 they
-hold 82 to 96 %. If the mean wander of a frame counted as an error, no factor would fit: with 4, chi² per degree of
-freedom is 1.8 for waves of a few rows, and 15 for a random walk that is slower than a frame."""
+OF_MODEL, OF_BLOCKS, BY_LEVERAGE = 3.0, 0.8, 0.8
+"""Factors on both parts of a shift's covariance, and exponent of `leverage`: chosen on pairs of three programs."""
 LINEAR_OF_MODEL, LINEAR_BY_VARIED, LINEAR_BY_LEVERAGE = 2.0, 1.27, 0.64
 """Factor on the model's covariance of the linear part, and its exponents.
 
@@ -137,6 +132,20 @@ def covariance(fit: Fit, believed: Believed, sharpness: float) -> tuple[Array, D
         sharpness=sharpness,
     )
     return model, doubt
+
+
+def mean_over_rows(fit: Fit) -> Array:
+    """Return the mean displacement over the rows of the overlap minus the fitted shift, (2,) in px.
+
+    Least squares weighs rows by their features. Where lines wander or the sample relaxes, its shift is the displacement
+    of the rows with the most features. Slope and curvature of a block of rows give the displacement of the block; with
+    few features it is drawn towards the shift, by the variance of the displacement over all blocks.
+    """
+    slope = fit.slope[:, :2]
+    curvature = np.maximum(np.diagonal(fit.curvature[:, :2, :2], axis1=1, axis2=2), 1e-9)
+    slope = slope - curvature * (slope.sum(axis=0) / curvature.sum(axis=0))  # a prior may have moved the shift
+    variance = np.maximum((slope**2 - curvature).sum(axis=0) / (curvature**2).sum(axis=0), 0.0)
+    return np.asarray(-(variance * slope / (1.0 + variance * curvature)).mean(axis=0))
 
 
 def _long_run(change: Array) -> Array:

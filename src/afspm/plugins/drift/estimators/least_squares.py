@@ -17,7 +17,7 @@ import numpy as np
 from afspm.basics import ConfigError
 from afspm.components import Array
 from afspm.plugins.drift.doubt.acceptance import WRONG_AT_MOST, MatchEvidence, above_repeats, agreement, texture
-from afspm.plugins.drift.doubt.covariance import Doubt, covariance
+from afspm.plugins.drift.doubt.covariance import Doubt, covariance, mean_over_rows
 from afspm.plugins.drift.doubt.nuisances import CREEP_SD_PX, Shear, averaged
 from afspm.plugins.drift.pairs.images import CommonGrid, Unusable, onto_common_grid, prepare
 from afspm.plugins.drift.pairs.noise import CrossingLines, FineFilter, without_lines
@@ -100,7 +100,7 @@ class LeastSquares:
         try:
             shear = _expected_shear(prior, reference, scan, grid)
             lines = _Lines.of(reference, scan, grid)
-            theta, model, seen, doubt = _fine(scene, box, coarse, lines, expected, shear)
+            theta, model, seen, doubt, to_mean = _fine(scene, box, coarse, lines, expected, shear)
         except Unusable as reason:
             rows, columns = box.shape
             return Registration.refused(f"the overlap of {columns} x {rows} pixels is {reason}")
@@ -109,6 +109,7 @@ class LeastSquares:
         by_model = model[:2, :2]
         found = _evidence(scene, box, theta, doubt.spread_of_evidence * by_model, likelihoods, expected)
         shift = doubt.shift(model)
+        theta[:2] += to_mean
         registration = self._registration(theta, shift, box, grid, found)
         wider = math.sqrt(float(np.linalg.det(shift) / np.linalg.det(by_model)))
         spreads = {"spread": wider, "spread_of_evidence": doubt.spread_of_evidence}
@@ -152,7 +153,7 @@ def _fine(
     lines: _Lines,
     expected: ExpectedShift | None,
     shear: Shear,
-) -> tuple[Array, Array, LinearSeen, Doubt]:
+) -> tuple[Array, Array, LinearSeen, Doubt, Array]:
     scene = without_spikes(without_scars_of_one(scene, theta), theta)
     fine = FineFilter.of(scene.first.values, scene.second.values)
     values = fine.applied(scene.first.values), fine.applied(scene.second.values)
@@ -166,7 +167,7 @@ def _fine(
     free = believed.precision.copy()
     free[2:SLOPES] = 0.0
     theta, total = averaged(information, pull + free @ believed.mean, free, shear)
-    return theta, total / DISTRUST, seen, doubt
+    return theta, total / DISTRUST, seen, doubt, mean_over_rows(fit)
 
 
 def _in_m(seen: LinearSeen, grid: CommonGrid) -> LinearSeen:
