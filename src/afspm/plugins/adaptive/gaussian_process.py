@@ -12,8 +12,9 @@ drift the values contradict each other. A constant velocity is enough for the re
 It is zero unless many values gain by it: edges and spots are no Gaussian process, and a few of their values may gain
 much by a false drift.
 
-Between two fits the parameters stay, and a measurement adds one row to the inverse of the covariance. `Places` follows
-these rows, so that another choice among m candidates costs n (n + m) for n measurements, and not n² (n + m).
+Between two fits the parameters stay, and a measurement adds one row to the inverse of the covariance.
+`PredictedPlaces` follows these rows, so that another choice among m candidates costs n (n + m) for n measurements, and
+not n² (n + m).
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ class GaussianProcess:
 
     def variance(self, xy_m: Array) -> Array:
         """Return the expected square error (m,) at positions (m, 2), scaled by the local roughness."""
-        return Places(self, xy_m).variance()
+        return PredictedPlaces(self, xy_m).variance()
 
     @property
     def noise_variance(self) -> float:
@@ -133,8 +134,8 @@ class GaussianProcess:
         return matern(distances(xy_m, self.positions_m), self.parameters.length_m)
 
 
-class Places:
-    """Places whose expected square errors follow the measurements that a process takes, one column for each.
+class PredictedPlaces:
+    """PredictedPlaces whose expected square errors follow the measurements that a process takes, one column for each.
 
     Args:
         model: process of the measurements.

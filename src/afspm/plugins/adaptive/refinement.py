@@ -29,9 +29,9 @@ from typing import Any, Final, Protocol, runtime_checkable
 import numpy as np
 
 from afspm.basics import InvalidValue
-from afspm.components import Array
+from afspm.components import SD_PER_MAD, Array
 from afspm.model import Region
-from afspm.plugins.adaptive.gaussian_process import GaussianProcess, Parameters, Places, distances, fitted
+from afspm.plugins.adaptive.gaussian_process import GaussianProcess, Parameters, PredictedPlaces, distances, fitted
 
 Point = Mapping[str, Any]
 Cell = tuple[int, int]
@@ -383,7 +383,7 @@ class LatticeMap:
 
 def _typical(squares: Array) -> float:
     # the variance of normal errors with this median square: a few large errors leave it as it is
-    return float(np.median(squares)) / 0.455
+    return SD_PER_MAD**2 * float(np.median(squares))
 
 
 class NestedGrid(LatticeMap):
@@ -410,7 +410,7 @@ class AdaptiveMap(LatticeMap):
         self.is_grid = False
         self._coarse = min(_CANDIDATES, self.lattice.levels)
         self._cells = self.lattice.cells(self._coarse)  # candidates, with those measured since the last fit
-        self._places: Places | None = None
+        self._places: PredictedPlaces | None = None
         self._followed = 0  # measured cells whose neighbours are candidates
 
     def _round(self) -> list[Cell]:
@@ -445,13 +445,13 @@ class AdaptiveMap(LatticeMap):
             return False
         return _typical(self._judged()[0]) > _UNEXPLAINED * float(np.var(self.measurements[:, 2]))
 
-    def _candidates(self) -> Places:
+    def _candidates(self) -> PredictedPlaces:
         model = self.model
         opened = [cell for done in list(self._done)[self._followed :] for cell in self._opened_by(done)]
         self._followed = len(self._done)
         if self._places is None or self._places.model is not model:
             self._cells = [cell for cell in dict.fromkeys([*self._cells, *opened]) if cell not in self._done]
-            self._places = Places(model, self.lattice.xy_m(self._cells))
+            self._places = PredictedPlaces(model, self.lattice.xy_m(self._cells))
         elif added := [cell for cell in dict.fromkeys(opened) if cell not in self._done]:
             self._cells += added
             self._places.add(self.lattice.xy_m(added))

@@ -65,7 +65,8 @@ class MatchEvidence:
             site, right or wrong. A wrong site is one of many, at a random distance from their mean; only the right one
             has its defects in their places.
         texture: agreement of the ground between features, in standard deviations; infinite without such ground. Bumps
-            of one shape fit each other anywhere, and the ground between them shows the place.
+            of one shape fit each other anywhere, and the ground between them shows the place. Not computed,
+            and infinite, if `searched` is at most `NARROW`.
         surprise: chi² of the shift, given the prior.
         searched: share of the scan's area in which the prior allows the match; 1 without a prior. In a smaller area
             fewer sites fit by chance.
@@ -108,10 +109,10 @@ class MatchEvidence:
         """Return the reason for refusing the match, for people; empty for an accepted match."""
         if self.rival > RIVAL_AT_MOST and self.searched > NARROW:
             return f"the surface repeats itself: {self._why('rival')}; an expected displacement would decide"
-        bare = self.texture < LEAST_TEXTURE and self.searched > NARROW
-        if bare and self.wrong > WITHOUT_TEXTURE * wrong_at_most and self.wrong <= wrong_at_most:
-            return f"{self._why('texture')}; an expected displacement would decide"
         if self.wrong <= wrong_at_most:
+            bare = self.texture < LEAST_TEXTURE and self.searched > NARROW
+            if bare and self.wrong > WITHOUT_TEXTURE * wrong_at_most:
+                return f"{self._why('texture')}; an expected displacement would decide"
             return ""
         objections = self.objections()
         why = self._why(max(objections, key=lambda name: objections[name]))

@@ -9,14 +9,13 @@ must be learnt from the same two noisy scans.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from afspm.basics import ConfigError
 from afspm.components import Array
-from afspm.plugins.drift.doubt.acceptance import WRONG_AT_MOST, MatchEvidence, above_repeats, agreement, texture
+from afspm.plugins.drift.doubt.acceptance import NARROW, WRONG_AT_MOST, MatchEvidence, above_repeats, agreement, texture
 from afspm.plugins.drift.doubt.covariance import Doubt, covariance, mean_over_rows
 from afspm.plugins.drift.doubt.nuisances import CREEP_SD_PX, Shear, averaged
 from afspm.plugins.drift.pairs.images import CommonGrid, Unusable, onto_common_grid, prepare
@@ -91,7 +90,7 @@ class LeastSquares:
         start = _coarse(scene, expected)
         if start is None:
             return Registration.refused("the scans overlap too little")
-        coarse, *likelihoods = start
+        coarse, likelihood, rival = start
         scene, grid, coarse = with_larger_pixels(scene, grid, coarse)
         expected = None if prior is None else ExpectedShift.of(prior, grid)
         box = scene.box(coarse[:2])
@@ -107,7 +106,7 @@ class LeastSquares:
         if not (np.isfinite(model).all() and np.hypot(*(theta - coarse)[:2]) < FARTHEST_PX):
             return Registration.refused("no displacement fits: the scans have no features in common")
         by_model = model[:2, :2]
-        found = _evidence(scene, box, theta, doubt.spread_of_evidence * by_model, likelihoods, expected)
+        found = _evidence(scene, box, theta, doubt.spread_of_evidence * by_model, (likelihood, rival), expected)
         shift = doubt.shift(model)
         theta[:2] += to_mean
         registration = self._registration(theta, shift, box, grid, found)
@@ -224,12 +223,13 @@ def _evidence(
     box: OverlapBox,
     theta: Array,
     total: Array,
-    likelihoods: Sequence[float],
+    likelihoods: tuple[float, float],
     expected: ExpectedShift | None,
 ) -> MatchEvidence:
     one, two, known = WarpedPair(*scene.smooth_splines, box, theta[:2]).warped(theta)
     one, two = without_lines(one, known), without_lines(two, known)
     elsewhere = MaskedCorrelation(known, known, ELSEWHERE_PX)
+    searched = 1.0 if expected is None else min(expected.area_px2 / scene.least_known, 1.0)
     return MatchEvidence(
         overlap=float(known.sum() / scene.least_known),
         sd_px=float(np.sqrt(np.linalg.eigvalsh(total)[-1])),
@@ -237,7 +237,7 @@ def _evidence(
         rival=likelihoods[1] / max(likelihoods[0], 1e-300),
         agreement=agreement(one, two, known),
         above_repeats=above_repeats(elsewhere.of(one, two), elsewhere.overlap, elsewhere.origin),
-        texture=texture(one, two, known),
+        texture=texture(one, two, known) if searched > NARROW else math.inf,
         surprise=0.0 if expected is None else expected.surprise(theta[:2], total),
-        searched=1.0 if expected is None else min(expected.area_px2 / scene.least_known, 1.0),
+        searched=searched,
     )

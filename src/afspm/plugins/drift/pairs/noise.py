@@ -58,11 +58,12 @@ class FineFilter:
         length = np.concatenate([cosine_frequencies(shape).ravel() for shape in shapes])
         width = max(1.0 / min(*first.shape, *second.shape), 1.0 / 64)
         index = (length / width).astype(np.intp)
-        power = np.bincount(index, squares) / np.maximum(np.bincount(index), 1)
+        count = np.bincount(index)
+        power = np.bincount(index, squares) / np.maximum(count, 1)
         floor = float(np.median(squares[length > TOP])) / MEDIAN_POWER
         signal = np.maximum(power - floor, 0.0)
         frequency = (np.arange(power.size) + 0.5) * width
-        gradients = np.where(frequency < 0.5, signal * np.bincount(index) * frequency**2, 0.0)
+        gradients = np.where(frequency < 0.5, signal * count * frequency**2, 0.0)
         sharpness = float(gradients[frequency > TOP].sum() / max(gradients.sum(), 1e-300))
         signal[: np.argmax(signal)] = signal.max()
         gain = np.sqrt(2.0 * signal / (2.0 * signal + floor + 1e-300))

@@ -10,7 +10,7 @@ import numpy as np
 from afspm.components import Array
 from afspm.plugins.drift.pairs.images import CommonGrid, Image
 from afspm.plugins.drift.pairs.noise import without_lines
-from afspm.plugins.drift.pairs.warp import OverlapBox, Scene, WarpedPair
+from afspm.plugins.drift.pairs.warp import OverlapBox, Scene, WarpedPair, in_whole_blocks
 
 LEAST_HALVED_PX = 128  # least side of a halved image: less may be too little to prove a match
 MOST_LOST = 0.01  # share of the information about the shift
@@ -29,10 +29,9 @@ def with_larger_pixels(scene: Scene, grid: CommonGrid, theta: Array) -> tuple[Sc
         theta: displacement, known to a fraction of a pixel; see `warp.WarpedPair`.
     """
     while lost_by_halving(scene, theta) <= MOST_LOST:
-        images = scene.first, scene.second
-        cut = [np.array(image.values.shape[::-1]) % 2 / 2 for image in images]  # moves the centres
-        scene, grid, theta = Scene(*map(_halved, images)), grid.halved(*cut), theta.copy()
-        theta[:2] = (theta[:2] - cut[0] + cut[1]) / 2
+        (first, cut1), (second, cut2) = (_halved(image) for image in (scene.first, scene.second))
+        scene, grid, theta = Scene(first, second), grid.halved(cut1, cut2), theta.copy()
+        theta[:2] = (theta[:2] - cut1 + cut2) / 2
     return scene, grid, theta
 
 
@@ -71,11 +70,10 @@ def _banded(power: Array) -> Array:
     return power
 
 
-def _halved(image: Image) -> Image:
+def _halved(image: Image) -> tuple[Image, Array]:
     # by the lower half of its cosine transform: a mean of four pixels would fold the noise of the upper half onto it
     from scipy.fft import dctn, idctn
 
-    ny, nx = (n // 2 for n in image.values.shape)
-    values = image.values[: 2 * ny, : 2 * nx]
-    known = np.asarray(image.known[: 2 * ny, : 2 * nx].reshape(ny, 2, nx, 2).all(axis=(1, 3)))
-    return Image(idctn(dctn(values, norm="ortho")[:ny, :nx], norm="ortho") / 2.0, known)
+    values, known, cut = in_whole_blocks(image, 2)
+    ny, nx = known.shape
+    return Image(idctn(dctn(values, norm="ortho")[:ny, :nx], norm="ortho") / 2.0, known), cut

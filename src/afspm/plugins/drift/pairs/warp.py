@@ -308,12 +308,19 @@ class Scene:
             factor //= 2
         if factor == 1:
             return self, 1, np.zeros(2)
-        cut = [np.array(image.values.shape[::-1]) % factor / 2 for image in (self.first, self.second)]
-        return Scene(_decimated(self.first, factor), _decimated(self.second, factor)), factor, cut[0] - cut[1]
+        (first, cut1), (second, cut2) = (_decimated(image, factor) for image in (self.first, self.second))
+        return Scene(first, second), factor, cut1 - cut2
 
 
-def _decimated(image: Image, factor: int) -> Image:
+def in_whole_blocks(image: Image, factor: int) -> tuple[Array, Mask, Array]:
+    """Return the values in whole blocks of pixels, the known blocks, and how far the centre moves back (x, y), px."""
     ny, nx = (n // factor for n in image.values.shape)
-    kept, blocks = np.s_[: ny * factor, : nx * factor], (ny, factor, nx, factor)
-    known = np.asarray(image.known[kept].reshape(blocks).all(axis=(1, 3)))
-    return Image(image.values[kept].reshape(blocks).mean(axis=(1, 3)), known)
+    kept = np.s_[: ny * factor, : nx * factor]
+    known = np.asarray(image.known[kept].reshape(ny, factor, nx, factor).all(axis=(1, 3)))
+    return image.values[kept], known, np.array(image.values.shape[::-1]) % factor / 2
+
+
+def _decimated(image: Image, factor: int) -> tuple[Image, Array]:
+    values, known, cut = in_whole_blocks(image, factor)
+    ny, nx = known.shape
+    return Image(values.reshape(ny, factor, nx, factor).mean(axis=(1, 3)), known), cut
