@@ -67,7 +67,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # images are the hardest surface of the families: without them more of the right ones are accepted
     images = "with" if cuts.there_are_images() else "without"
     eighth = ", an eighth of the pairs" * plan.quick
-    console.print(f"seed {plan.seed}{eighth}, {images} real images; {time.perf_counter() - began_s:.0f} s")
+    used = os.times()  # of this process and its workers, which have ended
+    cpu_s = used.user + used.system + used.children_user + used.children_system
+    console.print(
+        f"seed {plan.seed}{eighth}, {images} real images; {time.perf_counter() - began_s:.0f} s, "
+        f"{cpu_s:.0f} s of processor, load {os.getloadavg()[2]:.1f}"
+    )
     RESULT.parent.mkdir(exist_ok=True)
     RESULT.write_text(json.dumps([row.to_json() for row in rows], indent=1) + "\n", encoding="utf-8")
     RESULT.with_suffix(".txt").write_text(console.export_text(), encoding="utf-8")
