@@ -1,6 +1,7 @@
 """Registration by generalised least squares over all pixels (outline: `LeastSquares`).
 
-Tried without effect on the errors (at most 2 %): quintic splines, which take twice the time of cubic ones; the true
+Quintic splines in the last fit take 4 % more time than cubic ones, and errors are 13 % smaller on clear pairs (half on
+lattices), 6 % on pairs like real ones, 2 % on hard ones. Tried without effect on the errors (at most 2 %): the true
 noise of each row; weights that fall faster for rows that fit badly; larger patches where gradients are shrunk. Given
 the gradient without noise, the fit reached 1.20 times the bound instead of 1.35: most of the rest is that the surface
 must be learnt from the same two noisy scans.
@@ -157,7 +158,8 @@ def _fine(
     fine = FineFilter.of(scene.first.values, scene.second.values)
     values = fine.applied(scene.first.values), fine.applied(scene.second.values)
     inner = box.without_border(BORDER_PX)
-    pair = WarpedPair(*scene.splines(values), inner, theta[:2], lines.own_px, lines.crossing(inner, theta[:2]))
+    splines = scene.splines(values, order=5)
+    pair = WarpedPair(*splines, inner, theta[:2], lines.own_px, lines.crossing(inner, theta[:2]))
     believed = _believed(expected or ExpectedShift(theta[:2], FARTHEST_PX**2 * np.eye(2)))
     fit = generalised_least_squares(pair, theta, believed, fine)
     model, doubt = covariance(fit, believed, fine.sharpness)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,28 +16,32 @@ from afspm.plugins.drift.pairs.noise import CrossingLines
 
 Columns = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+Order = Literal[3, 5]
 
 
 @dataclass(frozen=True, eq=False)
 class Spline:
-    """Cubic spline interpolation of an image, at pixel coordinates (x, y) from its centre.
+    """Spline interpolation of an image, at pixel coordinates (x, y) from its centre.
 
     Attributes:
         known: mask of pixels that are more than two pixels from unknown pixels, and not made up; None: all.
+        order: 3; or 5, which takes longer. On clear lattices of 5 to 16 px, cubic splines double the error of a
+            displacement.
     """
 
     coefficients: Array
     known: Mask | None
+    order: Order = 3
 
     @classmethod
-    def of(cls, values: Array, known: Mask, made_up: Mask | None = None) -> Spline:
+    def of(cls, values: Array, known: Mask, made_up: Mask | None = None, order: Order = 3) -> Spline:
         """Return a spline that interpolates values exactly at the pixels."""
         from scipy.ndimage import binary_erosion, spline_filter
 
         inner = None if known.all() else binary_erosion(known, iterations=2, border_value=1)
         if made_up is not None:
             inner = ~made_up if inner is None else inner & ~made_up
-        return cls(spline_filter(values, mode="mirror"), inner)
+        return cls(spline_filter(values, order, mode="mirror"), inner, order)
 
     def at(self, x: Array, y: Array) -> tuple[Array, Mask]:
         """Return values at points, and the mask of known values."""
@@ -44,7 +49,7 @@ class Spline:
 
         ny, nx = self.coefficients.shape
         at = np.stack([y + (ny - 1) / 2, x + (nx - 1) / 2])
-        values = map_coordinates(self.coefficients, at, mode="mirror", prefilter=False)
+        values = map_coordinates(self.coefficients, at, order=self.order, mode="mirror", prefilter=False)
         known = (np.abs(x) <= (nx - 1) / 2 + 1e-6) & (np.abs(y) <= (ny - 1) / 2 + 1e-6)
         if self.known is not None:
             rows, columns = np.rint(at).astype(int)
@@ -58,7 +63,8 @@ class Spline:
         for axis, at in enumerate((y, x)):
             size = self.coefficients.shape[axis]
             start = np.floor(at[0] + (size - 1) / 2)
-            values = _combined(values, axis, int(start) - 1, at.size, _basis(at[0] + (size - 1) / 2 - start))
+            weights = _basis(at[0] + (size - 1) / 2 - start, self.order)
+            values = _combined(values, axis, int(start) - self.order // 2, at.size, weights)
             inside = np.abs(at) <= (size - 1) / 2 + 1e-6
             known &= inside[:, None] if axis == 0 else inside[None, :]
             picked.append(np.clip(np.rint(at + (size - 1) / 2).astype(int), 0, size - 1))
@@ -67,10 +73,12 @@ class Spline:
         return values, known
 
 
-def _basis(t: float) -> Array:
-    # cubic B-splines at four neighbours, t from 0 to 1 beyond the second
-    u = 1.0 - t
-    return np.array([u**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * u**2 + 3.0 * u**3, t**3]) / 6.0
+def _basis(t: float, order: Order) -> Array:
+    # B-splines at the neighbours, t from 0 to 1 beyond the last one on the left
+    from scipy.interpolate import BSpline
+
+    element = BSpline.basis_element(np.arange(order + 2.0))
+    return np.asarray(element(t + np.arange(order, -1.0, -1.0)))
 
 
 def _combined(values: Array, axis: int, first: int, count: int, weights: Array) -> Array:
@@ -274,10 +282,10 @@ class Scene:
     def band_splines(self) -> tuple[Spline, Spline]:
         return self.splines(self.band)
 
-    def splines(self, values: Both) -> tuple[Spline, Spline]:
+    def splines(self, values: Both, order: Order = 3) -> tuple[Spline, Spline]:
         """Return splines of filtered values, with the masks of the images."""
         one, two = (
-            Spline.of(each, image.known, image.made_up)
+            Spline.of(each, image.known, image.made_up, order)
             for each, image in zip(values, (self.first, self.second), strict=True)
         )
         return one, two
