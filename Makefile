@@ -222,7 +222,7 @@ AFTER ?= HEAD
 bench-compare: $(TEST)
 	@$(BIN)/python -m benchmarks.compare $(BEFORE) --after $(AFTER) $(NAMES)
 
-## drift: errors of the estimates beside the theoretical bound, and build/bench-drift.json, in half an hour.
+## drift: errors of the estimates beside the theoretical bound, and build/bench-drift.json, in 90 minutes of processor.
 ## EIGHTH=1 runs an eighth of the pairs, in four minutes, and judges the targets that allow no pair. LAND=1 lands this run
 bench-drift: $(TEST)
 	@$(BIN)/python -m benchmarks.drift $(if $(EIGHTH),--quick) $(if $(LAND),--land)

@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy import signal
+from scipy import ndimage, signal
 from tests.plugins.line_watch.line_scans_lab import (
     CHANGED_ROW,
     CHANNELS,
@@ -383,6 +383,21 @@ def test_change_that_is_a_function_of_height_or_follows_edges_is_looked_at(cause
     assert alarm.level is AlarmLevel.LOOK
     # what overshoots on few features looks like noise first: trace and retrace differ
     assert cause in alarm.why or cause == "overshoots"
+
+
+@pytest.mark.parametrize("long", [5, 7])
+def test_debris_that_smears_the_image_is_no_overshoot(long: int) -> None:
+    random = np.random.default_rng(8)
+    scan = ndimage.gaussian_filter(random.standard_normal((ROWS, ROWS)), 2.0)
+    scans = [
+        {name: 6e-9 * scan + 1e-10 * random.standard_normal(scan.shape) for name in CHANNELS} for _ in range(LEARNT + 1)
+    ]
+    smeared = heights(scans[LEARNT])
+    for values in smeared:
+        values[CHANGED_ROW:] = ndimage.uniform_filter1d(values[CHANGED_ROW:], long, axis=1)
+    alarm = stopped(taught(scans), smeared)
+    assert alarm is not None
+    assert CHANGED_ROW <= alarm.row <= CHANGED_ROW + 20
 
 
 def test_large_change_of_the_contrast_within_a_scan_is_the_tip() -> None:

@@ -48,6 +48,9 @@ def is_slight(before: Sequence[Sequence[RowFit]], after: Sequence[Sequence[RowFi
 def without_overshoot(lines: Sequence[Sequence[RowFit]], *, has_retrace: bool) -> list[list[RowFit]]:
     """Return the fits of some lines without the part of the differences that follows all edges alike.
 
+    Empty if this part lags behind the edges by more than it rises beyond them, as with debris that smears the image:
+    in rooms of the half "tried" the sum of its kernel was -0.13 and less, and 0.07 and more with overshoot.
+
     Args:
         has_retrace: whether the second fit of a line is its retrace, which runs the other way.
     """
@@ -57,6 +60,8 @@ def without_overshoot(lines: Sequence[Sequence[RowFit]], *, has_retrace: bool) -
     given = np.concatenate([one for line in basis for one in line])
     there = np.isfinite(wanted)
     found = np.linalg.lstsq(given[there], wanted[there], rcond=None)[0]
+    if found.sum() < 0.0:
+        return []
     return [
         [replace(fit, residual=fit.residual - one @ found) for fit, one in zip(line, of, strict=True)]
         for line, of in zip(lines, basis, strict=True)
