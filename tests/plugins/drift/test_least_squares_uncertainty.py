@@ -230,3 +230,11 @@ def test_noise_in_the_gradient_is_not_counted_as_information() -> None:
     assert np.diag(information) == pytest.approx(seen**2 * np.diag(spread), rel=1e-4)
     by_images_alone = theta + np.linalg.solve(curvature, theta)  # the prior has pulled theta towards zero
     assert pull == pytest.approx(information @ by_images_alone, rel=1e-6)
+
+
+@pytest.mark.filterwarnings("error")
+def test_image_with_a_flat_half_has_finite_shrunk_coefficients() -> None:
+    random = np.random.default_rng(0)
+    image, noise = 10.0 * random.standard_normal((96, 90)), 10.0 * random.standard_normal((96, 90))
+    image[:48] = 0.0
+    assert all(np.isfinite(each).all() for each in denoised(image, noise))

@@ -313,7 +313,8 @@ def denoised(image: Array, noise: Array) -> tuple[Array, Array]:
     apart = max(PATCH_PX // STEP_PX, math.isqrt(c[..., 0].size // ENOUGH_PATCHES))
     power = _typical(n[::apart, ::apart] ** 2) + TINY
     texture = np.maximum(_typical(c[::apart, ::apart] ** 2) - power, 0.0)
-    garrote, wiener = 1.0 - CERTAIN * power / np.maximum(c**2, TINY), texture / (texture + power)
+    # below the power of the noise the garrote is not the larger gain, and c² may be too small to divide by
+    garrote, wiener = 1.0 - CERTAIN * power / np.maximum(c**2, power), texture / (texture + power)
     gain = np.maximum(garrote, wiener)
     change = np.where(garrote > wiener, 2.0 - gain, wiener)  # derivative of c times its gain
     return _image(c * gain, image.shape), _image(n * change, image.shape)
