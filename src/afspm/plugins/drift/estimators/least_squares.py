@@ -1,6 +1,6 @@
 """Registration by generalised least squares over all pixels (outline: `LeastSquares`).
 
-Quintic splines in the last fit take 4 % more time than cubic ones, and errors are 13 % smaller on clear pairs (half on
+Quintic splines in the last fit take 5 % more time than cubic ones, and errors are 13 % smaller on clear pairs (half on
 lattices), 6 % on pairs like real ones, 2 % on hard ones. Tried without effect on the errors (at most 2 %): the true
 noise of each row; weights that fall faster for rows that fit badly; larger patches where gradients are shrunk. Given
 the gradient without noise, the fit reached 1.20 times the bound instead of 1.35: most of the rest is that the surface

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Literal
 
 import numpy as np
@@ -73,12 +73,17 @@ class Spline:
         return values, known
 
 
-def _basis(t: float, order: Order) -> Array:
-    # B-splines at the neighbours, t from 0 to 1 beyond the last one on the left
+@cache
+def _element(order: Order) -> Callable[[Array], Array]:
     from scipy.interpolate import BSpline
 
-    element = BSpline.basis_element(np.arange(order + 2.0))
-    return np.asarray(element(t + np.arange(order, -1.0, -1.0)))
+    element: Callable[[Array], Array] = BSpline.basis_element(np.arange(order + 2.0))
+    return element
+
+
+def _basis(t: float, order: Order) -> Array:
+    # B-splines at the neighbours, t from 0 to 1 beyond the last one on the left
+    return _element(order)(t + np.arange(order, -1.0, -1.0))
 
 
 def _combined(values: Array, axis: int, first: int, count: int, weights: Array) -> Array:
