@@ -8,7 +8,7 @@ TEST := .venv/.test
 DEV := .venv/.dev
 
 .PHONY: demo demo-drift dev test test-times test-programs test-packages test-all test-slow test-power-cut test-apart test-lowest mutants test-samples test-matrix test-nion coverage test-ui test-gateway test-translators test-clients test-octave test-windows test-hosts
-.PHONY: messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift bench-guests soak chaos crowd scanner-nights simulate replay-nights power-cut acts as-reported docs release-check test-plug-ins changelog clean
+.PHONY: bill messages real-data real-data-record test-nexus test-tiled check bench bench-compare bench-drift bench-guests soak chaos crowd scanner-nights simulate replay-nights power-cut acts as-reported docs release-check test-plug-ins changelog clean
 .DEFAULT_GOAL := demo
 
 SOURCES := pyproject.toml $(wildcard packages/*/pyproject.toml) uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -212,6 +212,10 @@ check: $(DEV)
 	@$(BIN)/python tools/quality.py
 	@$(BIN)/python tools/claims.py
 	@$(BIN)/python tools/doors.py
+
+## lines of code by capability, and how much each has grown since the last landing (tools/last_landing.txt)
+bill: $(TEST)
+	@$(BIN)/python tools/bill.py $(addprefix --base=,$(BASE))
 
 ## speed, beside bare pyzmq and beside the last landed run: a table, and build/bench.json. LAND=1 lands this run's ratios
 bench: $(TEST)
