@@ -615,6 +615,7 @@ class SimulatedInstrument:
         """
         lasts_s = self.setup.approach_s + self.coarse_m / _APPROACH_M_PER_S
         self.occupy("approach", lasts_s, now_s)
+        self.engaged = self.engaged and self._lifts_s is None  # a false landing ends with the next approach
         self._lands_s = now_s + lasts_s
         self._lifts_s = None if seems_s is None else self._lands_s + seems_s
 
