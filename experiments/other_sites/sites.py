@@ -1,5 +1,5 @@
 from afspm import Component, Region
-from afspm.basics import Count
+from afspm.basics import Count, NotClear
 
 
 class Sites(Component):
@@ -21,6 +21,11 @@ class Sites(Component):
         self.scope.end_experiment()
 
     def go_to_the_next(self) -> None:
-        self.scope.withdraw(*["x-coarse-away"] * 5)
-        self.scope.action("x-coarse-right")
+        while True:
+            self.scope.withdraw(*["x-coarse-away"] * 5)
+            try:
+                self.scope.action("x-coarse-right")
+                break
+            except NotClear as error:  # a person has had the microscope since the steps, or contact was lost
+                self.log.warning("the steps away are made again: %s", error.reason)
         self.scope.approach(timeout_s=300)

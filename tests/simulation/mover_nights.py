@@ -1,8 +1,9 @@
 """Nights with a coarse motor, with kills and faults: `python -m tests.simulation.mover_nights 200`.
 
 A component goes from site to site as it should, and another one sends requests at random: moves, approaches, scans. The
-scheduler, the translator and the components are real, and die at random. In the truth of the simulation, a move strikes
-a tip that is at the sample, or too near for a lateral step.
+scheduler, the translator and the components are real, and die at random. A person drives the motor back to the sample
+by hand, in MANUAL or while the controller is not reached. In the truth of the simulation, a move strikes a tip that is
+at the sample, or too near for a lateral step.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ AWAY, RIGHT, UP = "x-coarse-away", "x-coarse-right", "x-coarse-up"
 _STEPS = 20
 _MOVES = (AWAY, RIGHT, UP)
 _ACTS = (*_MOVES, *_MOVES, names.APPROACH, names.APPROACH, names.ENGAGE, names.RETRACT, names.RETRACT)
+_CONTINUES = tuple(range(45, int(LASTS_S), 40))  # a person lets the run continue
+_LEFT_M = 0.5e-6  # left by a person who drives the motor back: less than a lateral step runs out
 _REFUSALS = (Refused, ControlLost, NoResponse)
 
 
@@ -47,6 +50,7 @@ class Sites(Component):
             with suppress(*_REFUSALS), self.scope.control(timeout_s=600.0):
                 if self.memory.get("at", 0) != site:
                     self.scope.withdraw(*[AWAY] * 5, timeout_s=600.0)
+                    self.scope.wait_until(lambda: False, timeout_s=15.0)  # time for a person's hand
                     self.scope.action(RIGHT, timeout_s=600.0)
                     self.scope.approach(timeout_s=600.0)
                     self.memory["at"] = site
@@ -130,6 +134,24 @@ def panel(seed: int) -> list[dict[str, Any]]:
     return [{"at_s": at_s, "action": action} for at_s, action in (*acts, *(back if acts else ()))]
 
 
+def hands(seed: int) -> list[tuple[float, float, bool]]:
+    """Return when a person drives the motor back: the begin and duration of MANUAL (True) or of a lost contact."""
+    draw = random.Random(f"hands {seed}")
+    count = draw.randrange(len(_CONTINUES))
+    return [
+        (at_s + draw.uniform(2.0, 25.0), draw.uniform(5.0, 9.0), draw.random() < 0.5) for at_s in _CONTINUES[:count]
+    ]
+
+
+def drives_back(bench: Bench) -> None:
+    """Let a person bring a withdrawn tip near the sample by the coarse motor, which no controller shows."""
+    controller = bench._microscope._simulator._controller
+    assert controller is not None
+    if not controller.instrument.engaged:
+        controller.instrument.coarse_m = min(controller.instrument.coarse_m, _LEFT_M)
+        controller._keep()
+
+
 def night(seed: int, folder: Path, mutant: Mutant = "", lasts_s: float = LASTS_S) -> MoverNight:
     """Return what became of the night of a seed, or of its beginning."""
     draw = random.Random(seed)
@@ -138,7 +160,7 @@ def night(seed: int, folder: Path, mutant: Mutant = "", lasts_s: float = LASTS_S
         "feedback": {"mode": "current", "setpoint": 100e-12},
         "scanner": "stm-4k" if draw.random() < 0.5 else None,
         "coarse_steps": _STEPS,
-        "faults": faults(seed),
+        "faults": [*faults(seed), *(_lost(at_s, for_s) for at_s, for_s, is_manual in hands(seed) if not is_manual)],
         "panel": panel(seed),
     }
     bench = Bench(
@@ -152,7 +174,12 @@ def night(seed: int, folder: Path, mutant: Mutant = "", lasts_s: float = LASTS_S
     )
     for _ in range(draw.randrange(8)):
         bench.at(draw.uniform(1.0, LASTS_S), bench.kill, draw.choice(("", "sites", "scheduler", "translator")))
-    for at_s in range(45, int(LASTS_S), 40):
+    for at_s, for_s, is_manual in hands(seed):  # tip T1
+        if is_manual:
+            bench.at(at_s, bench.set_mode, ControlMode.MANUAL)
+            bench.at(at_s + for_s, bench.set_mode, ControlMode.AUTOMATED)
+        bench.at(at_s + 4.0, drives_back, bench)
+    for at_s in _CONTINUES:
         bench.at(at_s, bench.set_mode, ControlMode.AUTOMATED)
         bench.at(at_s + 1, bench.clear, Problem.DEVICE_MALFUNCTION)
     try:
@@ -160,6 +187,10 @@ def night(seed: int, folder: Path, mutant: Mutant = "", lasts_s: float = LASTS_S
     finally:
         bench.close()
     return judged(folder)
+
+
+def _lost(at_s: float, for_s: float) -> dict[str, Any]:
+    return {"kind": "restart", "at_s": at_s, "duration_s": for_s}
 
 
 def judged(folder: Path) -> MoverNight:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         MeasurementFailed,
         NoResponse,
         NoSuchItem,
+        NotClear,
         Refused,
         RequestError,
         TransportError,
@@ -106,6 +107,7 @@ __all__ = [
     "NeverLate",
     "NoResponse",
     "NoSuchItem",
+    "NotClear",
     "Plain",
     "PlainList",
     "PlainMapping",
@@ -167,7 +169,7 @@ if not TYPE_CHECKING:
             "afspm.basics.clock": "NS_PER_S Clock ExperimentClock NeverLate iso_utc utc_time",
             "afspm.basics.errors": (
                 "AfspmError ConfigError ControlLost ExperimentEnded FileError InvalidValue "
-                "MeasurementFailed NoResponse NoSuchItem Refused RequestError TransportError UnitError "
+                "MeasurementFailed NoResponse NoSuchItem NotClear Refused RequestError TransportError UnitError "
                 "WireError"
             ),
             "afspm.basics.exit_codes": "ExitCode",

@@ -191,6 +191,10 @@ class Refused(RequestError):
         self.again_ns = again_ns
 
 
+class NotClear(Refused):
+    """A refusal of a lateral move: others may have used the coarse motor since the run's steps away. New ones count."""
+
+
 class NoResponse(RequestError):
     """A request without an answer in time, which may or may not have been carried out."""
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from datetime import UTC
 
 from afspm import wire
-from afspm.basics.errors import NoResponse, Refused
+from afspm.basics.errors import NoResponse, NotClear, Refused
 from afspm.basics.formatting import day_and_time
 from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import ExperimentLink
@@ -304,4 +304,5 @@ def refused(kind: int, response: Response, where: str) -> Refused:
     code = ControlResponse(response.code).name if known else str(response.code)
     what = _ASKED_FOR.get(kind, request_name(kind))
     why = f"{what} was refused: {response.reason or code}"
-    return Refused(response.code, why, where=where, hint=code, again_ns=response.again_ns)
+    error = NotClear if response.detail is ResponseDetail.STEP_AWAY_AGAIN else Refused
+    return error(response.code, why, where=where, hint=code, again_ns=response.again_ns)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from afspm.basics.errors import ControlLost
+from afspm.basics.errors import ControlLost, NotClear
 from afspm.client.command_retry import CommandRetry
 from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import PublishedState
@@ -55,16 +55,20 @@ class MeasurementSetup:
         others = [one for one in target.settings if is_of_instrument(one.name)]
         if target.aside is None:
             return tuple(self._targets.reach(one, until_s) for one in others)
-        try:
-            # after a loss of control others may move the tip: nothing in the block goes on
-            with self._control.hold(until_s=until_s, unbroken=True):
-                if not all(self._targets.is_reached(one, until_s) for one in others):
-                    self._withdrawal.withdraw(until_s, target.aside)
-                reached = tuple(self._targets.reach(one, until_s) for one in others)
-                self._withdrawal.bring_back(until_s, approaches=bool(target.aside))
-        except ControlLost:
-            return ()  # the measurement begins again, with its targets
-        return reached
+        while True:
+            try:
+                # after a loss of control others may move the tip: nothing in the block goes on
+                with self._control.hold(until_s=until_s, unbroken=True):
+                    if not all(self._targets.is_reached(one, until_s) for one in others):
+                        self._withdrawal.withdraw(until_s, target.aside)
+                    reached = tuple(self._targets.reach(one, until_s) for one in others)
+                    self._withdrawal.bring_back(until_s, approaches=bool(target.aside))
+                return reached
+            except ControlLost:
+                return ()  # the measurement begins again, with its targets
+            except NotClear:  # the scheduler has logged why; each round makes the steps away again
+                if not target.aside:
+                    raise
 
     def prepare(self, target: Target, key: str, until_s: float | None, reached: tuple[Parameter, ...] = ()) -> None:
         """Set all settings of a target, and publish its sweep parameters with the values in force.

@@ -45,8 +45,12 @@ class Withdrawal:
 
     def away(self, away: Sequence[str], until_s: float | None) -> None:
         """Withdraw the tip, and move it away by the actions `away`; nothing brings it back. Raises as `bring_back`."""
-        if self._is_engaged(until_s) is not False:
-            self._move(names.RETRACT, until_s, engages=False)
+
+        def withdraw() -> None:
+            if self._is_engaged(until_s) is not False:
+                self._move(names.RETRACT, until_s, engages=False)
+
+        self._until_undisturbed(withdraw)
         self._step(away, until_s)
 
     def bring_back(self, until_s: float | None, *, approaches: bool = False) -> None:
@@ -75,13 +79,17 @@ class Withdrawal:
         """
         support = self._commands.read(ControlRequest.ACTION_SUPPORT, names.APPROACH, until_s)
         action = names.APPROACH if support.ok else names.ENGAGE
-        try:
+
+        def approach() -> None:
             self._act(action, until_s)
             for again_s in (_TWICE_S, 0.0):
                 if self._is_engaged(until_s) is not True:
                     why = f"the tip was not read at the sample twice after {action}, so it is withdrawn"
                     raise Refused(ControlResponse.ACTION_ERROR, why)
                 self._wait(lambda: False, self._link.until(self._link.clock.real_s(again_s)))
+
+        try:
+            self._until_undisturbed(approach)
         except (Refused, NoResponse) as error:
             self._link.log.error("the approach has failed, and the tip is withdrawn: %s", error)
             self._act(names.RETRACT, self._link.until(_GIVE_UP_S))
@@ -98,6 +106,17 @@ class Withdrawal:
             return None
         value = (wire.decode_parameter(response.payload).value or "").lower()
         return True if value in names.ON_WORDS else False if value in names.OFF_WORDS else None
+
+    def _until_undisturbed(self, move: Callable[[], None]) -> None:
+        # a failure says nothing if others had the microscope meanwhile: they may have stopped the move, or gone on
+        while True:
+            tenures = self._control.tenures
+            try:
+                return move()
+            except (Refused, NoResponse) as error:
+                if self._control.tenures == tenures:
+                    raise
+                self._link.log.warning("once more, since others had the microscope meanwhile: %s", error)
 
     def _step(self, away: Sequence[str], until_s: float | None) -> None:
         for action in away:

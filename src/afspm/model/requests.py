@@ -152,6 +152,8 @@ class ResponseDetail(IntEnum):
     OUTCOME_UNKNOWN = 2
     """A NO_RESPONSE to a request that may have been carried out."""
     EXPERIMENT_ENDED = 3
+    STEP_AWAY_AGAIN = 4
+    """The steps away from the sample count no more, since others may have used the coarse motor; new ones do."""
 
 
 @dataclass(slots=True)

@@ -201,6 +201,13 @@ class StateDraft(StateParts):
         """Save the state after this step even if none of its `saved_parts` changed."""
         self._is_to_be_saved = True
 
+    def others_may_have_acted(self, by: str = "") -> None:
+        """Forget where the tip and its motor are; `by` is the client that ends MANUAL, whose word on them counts."""
+        shown = self.panel.tip.engaged
+        self.limits = self.limits.with_movers(lambda state: state.unknown(at_sample=shown is True, by=by))
+        if shown is not False:
+            self.microscope = self.microscope.with_tip(away=False)
+
     def log(self, level: str, text: str) -> None:
         self.effects.append(Log(level, text))
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 from tests.unit.scheduler.logic_lab import Lab, in_control, killed, replies
 
 from afspm.model import (
+    ActByHand,
     ControlMode,
     ControlRequest,
     ControlResponse,
     Feedback,
+    PanelAct,
     Parameter,
     Response,
     ResponseDetail,
@@ -206,12 +209,66 @@ def test_current_far_from_the_setpoint_is_no_landing(motor: Motor) -> None:
         assert (shown.at_sample_ns is not None) is (setpoint == "-1e-10" or unit == "V"), (setpoint, unit)
 
 
-def test_state_survives_a_kill(motor: Motor) -> None:
+def test_ways_and_needed_approach_survive_a_kill_and_steps_away_do_not(motor: Motor) -> None:  # tip T1
     motor.goes_right()
     before = motor.state
-    assert before.is_unproved
     assert before.retracted == 40
-    assert killed(motor.lab, SETTINGS).core.state.limits.state.movers == before
+    after = killed(motor.lab, SETTINGS).core.state.limits.state.movers
+    assert (after.ways, after.is_unproved, after.needs_approach) == (before.ways, True, True)
+    assert (after.retracted, after.is_unknown) == (0, True)
+
+
+def pauses(motor: Motor) -> None:
+    motor.lab.mode("page", ControlMode.MANUAL)
+    motor.lab.mode("page", ControlMode.AUTOMATED)
+    motor.lab.take_control("experiment")
+
+
+def loses_contact(motor: Motor) -> None:
+    motor.lab.scope_is(ScopeState.UNDEFINED)
+    motor.lab.scope_is(ScopeState.FREE)
+
+
+def changes_at_the_panel(motor: Motor) -> None:
+    motor.lab.publish("ActByHand", ActByHand(motor.lab.now_ns, PanelAct.VALUES))
+
+
+@pytest.mark.parametrize(
+    "others_act", [pauses, loses_contact, changes_at_the_panel, lambda motor: motor.lab.translator()]
+)
+def test_steps_away_end_where_others_may_have_used_the_motor(
+    motor: Motor, others_act: Callable[[Motor], None]
+) -> None:  # tip T1
+    motor.withdraws()
+    motor.lab.publish("TipStatus", TipStatus(engaged=False))
+    motor.does(AWAY)
+    motor.does(AWAY)
+    others_act(motor)
+    refused = motor.refusal(RIGHT)
+    assert "0 of 40 steps" in refused.reason
+    assert "others may have moved it" in refused.reason
+    assert refused.detail is ResponseDetail.STEP_AWAY_AGAIN
+    motor.does(AWAY)
+    assert motor.refusal(RIGHT).detail is ResponseDetail.STEP_AWAY_AGAIN
+    motor.does(AWAY)
+    motor.does(RIGHT)
+
+
+def test_tip_is_read_twice_after_others_may_have_moved_it(motor: Motor) -> None:
+    motor.lab.publish("TipStatus", TipStatus(engaged=True))
+    pauses(motor)
+    assert motor.refusal(names.START_SCAN).again_ns is not None
+    motor.lab.later(experiment_s=1.0)
+    motor.does(names.START_SCAN)
+
+
+def test_withdrawn_tip_counts_as_away_only_as_long_as_it_is_shown(motor: Motor) -> None:
+    motor.withdraws()
+    motor.lab.publish("TipStatus", TipStatus(engaged=False))
+    pauses(motor)
+    assert motor.lab.core.state.microscope.risk.tip_away
+    motor.lab.publish("TipStatus", TipStatus(engaged=True))
+    assert not motor.lab.core.state.microscope.risk.tip_away
 
 
 def test_word_of_a_person_stands_for_the_steps_until_the_next_approach(motor: Motor) -> None:
@@ -223,9 +280,16 @@ def test_word_of_a_person_stands_for_the_steps_until_the_next_approach(motor: Mo
     assert motor.lab.says("page", ACTION, names.TIP_IS_CLEAR) == ControlResponse.ACTION_ERROR
     motor.lab.publish("TipStatus", TipStatus(engaged=False))
     assert motor.lab.says("page", ACTION, names.TIP_IS_CLEAR) == ControlResponse.SUCCESS
-    motor.lab.mode("page", ControlMode.AUTOMATED)
+    motor.lab.mode("page", ControlMode.AUTOMATED)  # by the same client: the word is of this moment
     motor.lab.take_control("experiment")
     motor.does(RIGHT)
+    pauses(motor)
+    assert "0 of 40" in motor.refusal(RIGHT).reason
+    motor.lab.mode("page", ControlMode.MANUAL)
+    assert motor.lab.says("page", ACTION, names.TIP_IS_CLEAR) == ControlResponse.SUCCESS
+    motor.lab.mode("quiet", ControlMode.AUTOMATED)  # the next morning, by another
+    motor.lab.take_control("experiment")
+    assert "0 of 40" in motor.refusal(RIGHT).reason
     motor.lands()
     motor.withdraws()
     assert "0 of 40" in motor.refusal(RIGHT).reason
@@ -236,8 +300,8 @@ def test_stage_of_another_instrument_counts_its_way() -> None:
     state = MoverState(retracted=40)
     for request in ("a", "b"):
         state = state.sent(settings, STAGE, 2.0, request, is_repeated=False)
-    assert state.refusal(settings, STAGE, 1.0) == ""
-    assert "would go 1.5 mm after 4 mm, and at most 5 mm in a run" in state.refusal(settings, STAGE, 1.5)
+    assert state.refusal(settings, STAGE, 1.0)[0] == ""
+    assert "would go 1.5 mm after 4 mm, and at most 5 mm in a run" in state.refusal(settings, STAGE, 1.5)[0]
 
 
 def test_approach_by_the_motor_is_proved_even_without_a_move(motor: Motor) -> None:

@@ -116,6 +116,8 @@ def _carry_out(draft: StateDraft, change: _Change) -> None:
     entries = control_entries(draft.now_ns, before, after, change.ask, change.row, problems)
     draft.event_log = draft.event_log.add(draft.now_s, *entries)
     draft.lease = draft.lease.held_by(after.holder, draft.now_ns)
+    if before.mode is not after.mode:
+        draft.others_may_have_acted(by="" if after.mode is ControlMode.MANUAL else change.ask.who)
     if draft.panel.why and after.mode is not ControlMode.MANUAL:  # a person has let the run continue
         draft.panel = replace(draft.panel, why="")
         if draft.microscope.risk.holds_z:  # its holder has lost control, and another component may get it

@@ -95,6 +95,7 @@ def _update_state(draft: StateDraft, published: object) -> None:
         is_back = published.engaged is True and draft.panel.tip.engaged is False
         draft.panel = replace(draft.panel, tip=published)
         if published.engaged:
+            draft.microscope = draft.microscope.with_tip(away=False)
             is_by_hand = draft.control.mode is ControlMode.MANUAL
             draft.limits = draft.limits.with_movers(lambda state: state.at_sample(is_back=is_back, by_hand=is_by_hand))
         if published.remedy:  # the act itself may have been lost with its translator
@@ -106,7 +107,7 @@ def _update_state(draft: StateDraft, published: object) -> None:
 
 
 def _take_act(draft: StateDraft, act: ActByHand) -> None:
-    draft.limits = draft.limits.with_movers(MoverState.near)
+    draft.others_may_have_acted()
     draft.limits = draft.limits.seen(Parameter(one.parameter, one.after, one.unit or None) for one in act.changes)
     is_manual = draft.control.mode is ControlMode.MANUAL
     for one in act.changes:
@@ -135,6 +136,8 @@ def _update_scope_state(draft: StateDraft, state: ScopeState) -> None:
         draft.limits = draft.limits.with_movers(MoverState.free)
     elif state is ScopeState.INTERRUPTED:
         draft.limits = draft.limits.with_movers(MoverState.interrupted)
+    elif state is ScopeState.UNDEFINED:
+        draft.others_may_have_acted()
     draft.watchdog = draft.watchdog.state_reported(draft.microscope)
     approvals.state_changed(draft, before)
     if draft.microscope.is_free != before.is_free:

@@ -106,11 +106,11 @@ def handle(draft: StateDraft, event: RequestIn) -> None:
 
 
 def _take_word(draft: StateDraft, event: RequestIn) -> None:
-    if draft.panel.tip.engaged is not False:
+    if draft.panel.tip.engaged is not False or draft.microscope.lost_since_s is not None:
         why = "the tip is not shown as withdrawn: withdraw it, and move it away"
         answers.answer(draft, event, ControlResponse.ACTION_ERROR, why)
         return
-    draft.limits = draft.limits.with_movers(lambda state: replace(state, is_clear=True))
+    draft.limits = draft.limits.with_movers(lambda state: replace(state, cleared_by=event.name))
     draft.log("WARNING", f"{event.name} says that the tip is far enough from the sample for lateral moves")
     answers.answer(draft, event, ControlResponse.SUCCESS)
 

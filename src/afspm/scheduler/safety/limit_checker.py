@@ -31,6 +31,7 @@ from afspm.model import (
     RegionChange,
     Request,
     Response,
+    ResponseDetail,
     ScanParameters,
     component_of,
     names,
@@ -73,11 +74,18 @@ _READ_FOR_ACTIONS = _OF_CURVES.union(*_TREATMENTS.values())
 class _Breach(Exception):
     """The error that a limit is broken; raised and caught in this module alone."""
 
-    def __init__(self, code: ControlResponse, reason: str, again_ns: int | None = None) -> None:
+    def __init__(
+        self,
+        code: ControlResponse,
+        reason: str,
+        again_ns: int | None = None,
+        detail: ResponseDetail = ResponseDetail.NONE,
+    ) -> None:
         super().__init__(reason)
         self.code = code
         self.reason = reason
         self.again_ns = again_ns
+        self.detail = detail
 
 
 class _Use(NamedTuple):
@@ -113,7 +121,7 @@ class LimitChecker:
             self._check(_Use(who, request.id, now_ns, is_repeated), request, used)
             self._check_movers(request)
         except _Breach as breach:
-            return Response(int(breach.code), b"", breach.reason, request.id, again_ns=breach.again_ns)
+            return Response(int(breach.code), b"", breach.reason, request.id, breach.detail, breach.again_ns)
         except (ParameterValueError, InvalidValue) as error:
             return Response(int(ControlResponse.PARAM_ERROR), b"", str(error), request.id)
         return None
@@ -308,8 +316,9 @@ class LimitChecker:
     def _check_movers(self, request: Request) -> None:
         settings, state = self.limits.movers, self.state.movers
         for name, way in self._moves(request):
-            if why := state.refusal(settings, name, way):
-                raise _Breach(_error_of(request), why)
+            why, detail = state.refusal(settings, name, way)
+            if why:
+                raise _Breach(_error_of(request), why, detail=detail)
         action = request.subject if request.kind == ControlRequest.ACTION else None
         if action in settings.undeclared:
             why = f"{action} moves the coarse motor: declare it in the experiment file ([limits.movers.{action}])"

@@ -7,7 +7,11 @@
 | a measurement | an approach after the last move; the tip read at the sample twice, the current near its setpoint |
 
 The two readings are `PROVED_AFTER_S` apart. A request counts from the moment at which it is sent. With an unknown
-outcome, a move counts as made, and steps away do not. The state is kept over a restart.
+outcome, a move counts as made, and steps away do not.
+
+No controller shows its motor. So steps away, a person's word and the proof end wherever others may have used it unseen
+(`MoverState.unknown`): with MANUAL (its begin and its end), a lost contact, and a restart of translator or scheduler.
+The ways, and the approach that is needed, stay; a way then means "at least".
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ from typing import Final, Literal
 
 from afspm.basics.formatting import quantity
 from afspm.basics.frozen import replace, without
-from afspm.model import Parameter, names
+from afspm.model import Parameter, ResponseDetail, names
 
 Direction = Literal["lateral", "away"]
 PROVED_AFTER_S: Final = 1.0
@@ -79,7 +83,8 @@ class MoverState:
         pending: steps away that are not answered yet, by request.
         answered: steps away that are answered; they are made once the microscope is free.
         retracted: steps away that were made since the tip was last at the sample.
-        is_clear: whether, by the word of a person since then, the tip is far enough for a lateral move.
+        is_unknown: whether others may have used the motor since the tip was last seen at the sample.
+        cleared_by: the client through which a person has stated that the tip is far enough for a lateral move.
         is_unproved: whether the tip was not proved at the sample since a move, an approach by the motor, or the begin.
         needs_approach: whether something was moved, and no approach has begun since.
         at_sample_ns: the experiment time of the first of the readings that show the tip at the sample.
@@ -89,26 +94,31 @@ class MoverState:
     pending: Mapping[str, int] = field(default_factory=dict)
     answered: int = 0
     retracted: int = 0
-    is_clear: bool = False
+    is_unknown: bool = False
+    cleared_by: str = ""
     is_unproved: bool = False
     needs_approach: bool = False
     at_sample_ns: int | None = None
 
-    def refusal(self, settings: MoverSettings, name: str, way: float) -> str:
-        """Return why a mover may not go this way; empty: it may, if the tip is withdrawn."""
+    def refusal(self, settings: MoverSettings, name: str, way: float) -> tuple[str, ResponseDetail]:
+        """Return why a mover may not go this way, and a detail for programs; empty: it may, if the tip is withdrawn."""
         mover = settings.movers[name]
         gone = self.ways.get(name, 0.0)
         if gone + way > mover.total * (1 + 1e-9):
             so_far, most = mover.way_text(gone), mover.way_text(mover.total)
-            return f"{name} would go {mover.way_text(way)} after {so_far}, and at most {most} in a run ({mover.source})"
-        if mover.direction == "lateral" and not self.is_clear and self.retracted < settings.retraction:
+            why = f"{name} would go {mover.way_text(way)} after {so_far}, and at most {most} in a run ({mover.source})"
+            return why, ResponseDetail.NONE
+        if mover.direction == "lateral" and not self.cleared_by and self.retracted < settings.retraction:
+            others = "others may have moved it (MANUAL, a lost contact, a restart)"
+            since = others if self.is_unknown else "its last approach"
             steps = f"{self.retracted} of {settings.retraction} steps away from the sample ({settings.source})"
-            return (
-                f"{name} moves the sample along, and since its last approach the tip has gone {steps}: first retract it"
+            why = (
+                f"{name} moves the sample along, and since {since} the tip has gone {steps}: first retract it"
                 f" with the coarse motor ({_named(settings)}), or let a person say that it is clear:"
                 " afspm continue --tip-is-clear"
             )
-        return ""
+            return why, ResponseDetail.STEP_AWAY_AGAIN if self.is_unknown else ResponseDetail.NONE
+        return "", ResponseDetail.NONE
 
     def sent(self, settings: MoverSettings, name: str, way: float, request: str, *, is_repeated: bool) -> MoverState:
         """Count a move that is sent. A repeated one may be answered from memory, so its steps away do not count."""
@@ -138,7 +148,18 @@ class MoverState:
 
     def near(self) -> MoverState:
         """Forget how far the tip was: it comes to the sample, is there, or moves as nothing here knows."""
-        return replace(self, pending={}, answered=0, retracted=0, is_clear=False)
+        return replace(self, pending={}, answered=0, retracted=0, is_unknown=False, cleared_by="")
+
+    def unknown(self, *, at_sample: bool, by: str = "") -> MoverState:
+        """Forget the steps away and the proof: others may have used the motor.
+
+        Args:
+            at_sample: whether the tip was last shown there; otherwise it is unproved anyway once it is back.
+            by: who ends MANUAL; a word of the same client counts for what follows.
+        """
+        word = self.cleared_by if self.cleared_by == by else ""
+        state = replace(self.near(), is_unknown=not at_sample, cleared_by=word, at_sample_ns=None)
+        return replace(state, is_unproved=self.is_unproved or at_sample)
 
     def withdrawn(self) -> MoverState:
         """Forget the steps away, since a withdrawal may end them."""
