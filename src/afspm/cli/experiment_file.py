@@ -68,7 +68,7 @@ def check(
                 experiment.planned_work(), experiment.clock().speed, datetime.now(UTC), experiment.order()
             ):
                 console.print(line, markup=False, soft_wrap=True)
-            for line in experiment.waits():
+            for line in experiment.notes():
                 console.print(line, markup=False, soft_wrap=True)
     if any(finding.is_error for finding in findings):
         raise typer.Exit(1)

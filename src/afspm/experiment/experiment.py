@@ -206,10 +206,14 @@ class Experiment:
         limits = self.resolved.limits
         return {name: one and with_waits(name, plans[name], one, limits) for name, one in estimates.items()}
 
-    def waits(self) -> list[str]:
-        """Return a sentence for each limit on time that may delay a component, besides those in `planned_work`."""
-        plans = self.resolved.plans.items()
-        return [line for name, plan in plans for line in further_waits(name, plan, self.resolved.limits)]
+    def notes(self) -> list[str]:
+        """Return sentences for the person: the motor by hand, and limits on time besides those in `planned_work`."""
+        limits, plans = self.resolved.limits, self.resolved.plans.items()
+        by_hand = (
+            "use the motors of [limits.movers] by hand in MANUAL alone (`afspm pause`): no controller shows it else"
+        )
+        notes = [by_hand] if limits.movers.movers else []
+        return notes + [line for name, plan in plans for line in further_waits(name, plan, limits)]
 
     def clock(self) -> ExperimentClock:
         """Return the clock of a run that begins now, from [clock]."""
