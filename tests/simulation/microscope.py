@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from afspm import wire
 from afspm.basics.errors import InvalidValue
 from afspm.basics.exit_codes import ExitCode
-from afspm.basics.plain_data import Plain
 from afspm.model import (
     ActByHand,
     ControlRequest,
@@ -35,6 +34,7 @@ from afspm.testing.components.memory_network import ControlLine, Feed, Subscribe
 from afspm.testing.components.simulated_process import Process
 from afspm.testing.components.simulated_time import SimulatedTime, Timer
 from afspm.translator.requests import RequestOutcomes
+from afspm.translator.state import KeptState
 from tests.simulation.codec import TableCodec
 from tests.simulation.panel import MakerPanel
 
@@ -132,7 +132,7 @@ class FakeMicroscope(Process):
         self.panel: MakerPanel | None = None
         self.turned: set[str] = set()
         self._codec = codec
-        self._kept: Plain = {}  # on its disk
+        self._kept: KeptState = {}  # on its disk
         self._newest_ns = 0
         self._history: deque[Packet] = deque(maxlen=_HISTORY)
         self._forget()

@@ -12,7 +12,7 @@ from afspm.translator.driver_base import DriverBase
 from afspm.translator.judge import Claim, ResultVerdict, Stated, Witness, judge
 from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.translator.setting_groups import FRAME, POSITION, frame, frame_outside
-from afspm.translator.state import Kept
+from afspm.translator.state import KeptState
 
 _PROVED_ELSEWHERE = frozenset((*FRAME, *POSITION, FEEDBACK_ON))
 """The frame and the place are compared with the result, and the feedback with the wish of the run."""
@@ -28,7 +28,7 @@ class Claims:
         repeated: the sentence of a contradiction that came twice in a row, until it is taken; empty: none.
     """
 
-    def __init__(self, driver: DriverBase, kept: Kept) -> None:
+    def __init__(self, driver: DriverBase, kept: KeptState) -> None:
         self._driver = driver
         self._kept = kept.setdefault("claims", {"next": {}, "asked": None, "running": None, "contradicted": ""})
         self._end: dict[str, Value] = {}

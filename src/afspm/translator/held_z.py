@@ -33,7 +33,8 @@ from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.translator.setters import apply
 from afspm.translator.state import TranslatorState
 
-_KEY, _ENDED = "held_z", "held_z_ended"
+_KEY: Final = "held_z"
+_ENDED: Final = "held_z_ended"
 _OFF, _HELD, _BACK, _FAILED = "off", "held", "back", "failed"
 _RESTORED: Final = (names.TIP_BIAS_VOLTAGE, names.ZCTRL_SETPOINT, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN)
 """The settings of the way back, in this order: all that decides where the feedback brings the tip, and how."""

@@ -30,7 +30,7 @@ from afspm.model.panel import ChangedValue
 from afspm.translator.judge import SETTINGS
 from afspm.translator.parameters import FEEDBACK_ON, ParameterTable, Value
 from afspm.translator.setting_groups import FRAME, POSITION
-from afspm.translator.state import Kept
+from afspm.translator.state import KeptState
 from afspm.translator.wished_feedback import CALM, SINCE_BEFORE, FeedbackLevel, WishedFeedback
 
 _STILL: Final = CALM | {ScopeState.SPEC}
@@ -62,7 +62,7 @@ class PanelWatch:
 
     def __init__(
         self,
-        kept: Kept,
+        kept: KeptState,
         table: ParameterTable,
         written: Callable[[str, Value], bool],
         feedback: WishedFeedback,
@@ -199,14 +199,14 @@ class PanelWatch:
         return act
 
     def _see_tip(self, now: Mapping[str, Value]) -> None:
-        engaged, on = now.get(names.ENGAGED), now.get(FEEDBACK_ON)
+        engaged, on = _known(now.get(names.ENGAGED)), _known(now.get(FEEDBACK_ON))
         self._kept |= {"engaged": engaged, "tip_is_moved": self._tip_is_moved}
         if engaged:
             self._kept["was_engaged"] = True
         if engaged is not False and on is not False:
             self._kept["tip_by_hand"] = ""
         by_hand = str(self._kept.get("tip_by_hand") or "")
-        self.tip = TipStatus(_known(engaged), _known(on), by_hand)
+        self.tip = TipStatus(engaged, on, by_hand)
 
     def _changes(
         self, before: Mapping[str, Value], now: Mapping[str, Value], watched: Collection[str]

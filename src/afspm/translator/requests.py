@@ -11,7 +11,6 @@ from functools import partial
 
 from afspm import wire
 from afspm.basics.errors import WireError
-from afspm.basics.plain_data import Plain
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -32,7 +31,7 @@ from afspm.translator.driver_base import LOST, DriverBase
 from afspm.translator.hurry import unhurried
 from afspm.translator.observer import Observer
 from afspm.translator.setting_groups import KeptSettings
-from afspm.translator.state import TranslatorState
+from afspm.translator.state import KeptState, TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
 from afspm.translator.trace import TRACE
 from afspm.transport.port import RequestReceived
@@ -236,7 +235,7 @@ class RequestOutcomes:
             was not done. Otherwise a request that was begun and has no outcome may have been done.
     """
 
-    def __init__(self, kept: Plain, *, all_or_nothing: bool) -> None:
+    def __init__(self, kept: KeptState, *, all_or_nothing: bool) -> None:
         self._shelves: tuple[dict[str, str], ...] = kept.setdefault("ledger", {}), kept.setdefault("unnumbered", {})
         self._kept = kept
         kept.setdefault("forgotten", {})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypedDict, cast
+
 from afspm.basics.clock import Clock
 from afspm.basics.plain_data import Plain
 from afspm.model import ControlRequest, Request, ScopeState, ScopeStatus
@@ -13,6 +15,35 @@ Kept = Plain
 """JSON values by name, kept on disk."""
 
 
+class KeptState(TypedDict, total=False):
+    """All that a translator keeps on disk; docs/explanation/at-the-panel.md says of each until when it is believed."""
+
+    said: int
+    seen_ns: int
+    last_ns: int
+    ledger: dict[str, str]
+    unnumbered: dict[str, str]
+    forgotten: dict[str, int]
+    outbox: Plain
+    claims: Plain
+    spoiled: str
+    feedback_off: bool
+    feedback_was_on: bool | None
+    may_have_switched: bool
+    feedback: Plain
+    feedback_off_by: str
+    engaged: bool | None
+    was_engaged: bool
+    tip_is_moved: bool
+    tip_by_hand: str
+    temporary: Plain
+    treatment: Plain
+    unproved_treatment: str
+    held_z: Plain
+    held_z_ended: str
+    held_z_settings: Plain
+
+
 class FeedbackWatch:
     """A record of whether a request, rather than a person at the panel, has switched the feedback off.
 
@@ -20,7 +51,7 @@ class FeedbackWatch:
         kept: JSON values that outlive a kill.
     """
 
-    def __init__(self, kept: Kept) -> None:
+    def __init__(self, kept: KeptState) -> None:
         self._kept = kept
 
     @property
@@ -68,7 +99,7 @@ class TranslatorState:
     def __init__(self, memory: Memory, clock: Clock, result_timeout_s: float) -> None:
         self._memory = memory
         self._clock = clock
-        self.kept: Kept = memory.setdefault("translator", {"said": 0, "ledger": {}, "outbox": {}})
+        self.kept = cast(KeptState, memory.setdefault("translator", {"said": 0, "ledger": {}, "outbox": {}}))
         self.feedback = FeedbackWatch(self.kept)
         self.sequence = StatusSequence(ScopeStatus(ScopeState(self.kept["said"])), result_timeout_s)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from typing import Final
 
 from afspm.model import ScopeState, ScopeStatus
 from afspm.translator.driver_base import LOST, DriverBase
@@ -18,7 +19,7 @@ from afspm.translator.setting_groups import MOVES
 from afspm.translator.state import TranslatorState
 from afspm.translator.treatment_end import TreatmentEnd
 
-_KEY = "temporary"
+_KEY: Final = "temporary"
 
 
 class TemporarySettings:

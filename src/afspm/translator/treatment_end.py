@@ -11,10 +11,10 @@ import logging
 from typing import Final
 
 from afspm.basics.errors import Refused
-from afspm.basics.plain_data import Plain
 from afspm.model import ControlResponse, ScopeState, ScopeStatus, names
 from afspm.translator.driver_base import DriverBase
 from afspm.translator.parameters import FEEDBACK_ON
+from afspm.translator.state import KeptState
 
 BETWEEN_S: Final = 1.0
 """Least experiment time between the two readings of the current that prove that the feedback holds it."""
@@ -23,7 +23,8 @@ LONGEST_S: Final = 5.0
 NEAR: Final = 2.0
 """Largest ratio of current and setpoint, and of setpoint and current, at which the feedback holds the current."""
 _LOOK_S: Final = 0.25  # experiment time between readings, until the current is near its setpoint
-_KEY, _UNPROVED = "treatment", "unproved_treatment"
+_KEY: Final = "treatment"
+_UNPROVED: Final = "unproved_treatment"
 
 
 class TreatmentEnd:
@@ -35,7 +36,7 @@ class TreatmentEnd:
         kept: JSON values that outlive a kill; the caller saves them.
     """
 
-    def __init__(self, driver: DriverBase, kept: Plain, log: logging.Logger) -> None:
+    def __init__(self, driver: DriverBase, kept: KeptState, log: logging.Logger) -> None:
         self._driver, self._kept, self._log = driver, kept, log
 
     def expect(self, action: str, state: ScopeState | None) -> None:

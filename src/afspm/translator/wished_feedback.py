@@ -20,7 +20,7 @@ from enum import Enum, auto
 from typing import Final
 
 from afspm.model import ScopeState, names
-from afspm.translator.state import Kept
+from afspm.translator.state import KeptState
 
 CALM: Final = frozenset({ScopeState.FREE, ScopeState.SCANNING})
 """States in which the controller itself changes neither settings nor the feedback."""
@@ -58,7 +58,7 @@ class WishedFeedback:
         news: a sentence for the log, until it is taken.
     """
 
-    def __init__(self, kept: Kept, settles_s: float, *, follows: bool = False) -> None:
+    def __init__(self, kept: KeptState, settles_s: float, *, follows: bool = False) -> None:
         self._kept = kept.setdefault("feedback", dict(_AT_FIRST))
         self._settles_s = settles_s
         self._follows = follows
