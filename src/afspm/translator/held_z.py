@@ -7,11 +7,12 @@
 | `back` | on its way to the height of the setpoint, then waits for the settings of before | with the feedback on |
 | `failed` | withdrawn: a part of the way back was refused or could not be read | when it has been withdrawn |
 
-**The way back** is one request: first z, since a tip that is nearer than the setpoint is in danger; then bias, setpoint
-and gains as they were read before, since a feedback that acts on another bias or setpoint drives the tip into the
-sample; each is read back; then the feedback. Everything that it needs is on disk before the feedback is switched off.
-It begins with a reading of z and can be repeated from any step: a translator that is restarted, or reconnects to a lost
-controller, does so before anything else.
+**The way back** is one request: first z, since a tip that is nearer than the setpoint is in danger; then bias,
+setpoint and gains as they were read before, since a feedback that acts on another bias or setpoint drives the tip
+into the sample; each is read back; then the feedback. A person may switch the feedback on before or meanwhile: where
+it holds a current, the settings are set back in an order that never narrows the gap. Everything that the way back
+needs is on disk before the feedback is switched off. It begins with a reading of z and can be repeated from any step:
+a translator that is restarted, or reconnects to a lost controller, does so before anything else.
 
 A ramp takes a step at each look, so that a request to withdraw the tip never waits for it.
 """
@@ -28,6 +29,7 @@ from afspm.basics.formatting import lengths_text, quantity
 from afspm.basics.plain_data import Plain
 from afspm.model import ControlResponse, Response, ScopeState, ScopeStatus, names
 from afspm.model.microscope_status import STARTS, STOPS
+from afspm.model.setting_order import widening_first
 from afspm.translator.driver_base import LOST, Action, DriverBase
 from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.translator.setters import apply
@@ -37,7 +39,7 @@ _KEY: Final = "held_z"
 _ENDED: Final = "held_z_ended"
 _OFF, _HELD, _BACK, _FAILED = "off", "held", "back", "failed"
 _RESTORED: Final = (names.TIP_BIAS_VOLTAGE, names.ZCTRL_SETPOINT, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN)
-"""The settings of the way back, in this order: all that decides where the feedback brings the tip, and how."""
+"""The settings of the way back: all that decides where the feedback brings the tip, and how."""
 _STEP_M: Final = 10e-12
 """Longest step of a ramp: a fifth of the decay of a tunnelling current, so that an abort comes in time."""
 _READINGS: Final = 8
@@ -338,15 +340,18 @@ class HeldZ:
 
     def _set_back(self, former: Mapping[str, Value]) -> str:
         # one after the other, each read back; return why one is not as before
-        for name, value in former.items():
-            try:
-                now = self._driver.in_force([name])
-                if not self._driver.same(name, now[name], value, now):
-                    self.is_set(apply(self._driver, {name: value}))
-            except LOST:
-                raise
-            except Exception as error:  # a driver may raise anything
-                return f"{name} is not set back to {self._driver.table[name].quantity(value)}: {error}"
+        driver, row = self._driver, self._driver.table.get(names.ZCTRL_SETPOINT)
+        holds_current = row is not None and row.si_unit == "A"
+        name = next(iter(former), "")
+        try:
+            for name in widening_first(driver.in_force(former), former) if holds_current else former:
+                now = driver.in_force([name])
+                if not driver.same(name, now[name], former[name], now):
+                    self.is_set(apply(driver, {name: former[name]}))
+        except LOST:
+            raise
+        except Exception as error:  # a driver may raise anything
+            return f"{name} is not set back to {driver.table[name].quantity(former[name])}: {error}"
         return ""
 
     def _fail(self, found: Plain, why: str) -> None:

@@ -262,6 +262,36 @@ def test_feedback_switched_on_by_a_person_ends_the_hold(held: Any) -> None:
     assert "the feedback was switched on beside it" in act(held, names.RELEASE_Z).reason
 
 
+# tip T5: the bias came first, while the setpoint was ten times as high
+@pytest.mark.parametrize("is_on", [True, False], ids=["by a person", "by the run"])
+@pytest.mark.parametrize(("bias_v", "setpoint_a"), [(1.0, 1e-9), (0.01, 1e-11), (-1.0, 1e-9)])
+def test_way_back_never_narrows_the_gap_and_ends_with_the_feedback_on(
+    held: Any, monkeypatch: pytest.MonkeyPatch, bias_v: float, setpoint_a: float, is_on: bool
+) -> None:
+    names_of_gap = (names.TIP_BIAS_VOLTAGE, names.ZCTRL_SETPOINT)
+    at_offset(held, 0.0, bias_v)
+    assert put(held, names.ZCTRL_SETPOINT, setpoint_a).ok
+    driver: Driver = held.translator.driver
+    gaps: list[float] = []
+    plain = driver.set
+
+    def watched(values: dict[str, Any]) -> None:
+        plain(values)
+        now: dict[str, Any] = driver.in_force([*names_of_gap, names.FEEDBACK_ON])
+        gaps.append(abs(now[names.TIP_BIAS_VOLTAGE] / now[names.ZCTRL_SETPOINT]))
+        assert names.FEEDBACK_ON in values or now[names.FEEDBACK_ON] is is_on
+
+    if is_on:
+        driver.put_in_force({names.FEEDBACK_ON: True})
+    else:
+        assert act(held, names.RELEASE_Z).ok
+    monkeypatch.setattr(driver, "set", watched)
+    until_free(held)
+    assert min(gaps) >= 0.999e9, "as before and in the hold: 1 V for each nA"
+    assert [number(held, name) for name in names_of_gap] == pytest.approx([0.1, 1e-10])
+    assert get(held, names.FEEDBACK_ON) == "true"
+
+
 def test_controller_lost_in_a_hold_ends_it(held: Any) -> None:
     at_offset(held, -100e-12)
     held.translator._connection.lose(ConnectionError("unplugged"))
