@@ -80,22 +80,25 @@ class HeldHeight:
 
     def check(self) -> None:
         """Raise Refused with the reason if z is held no more: a bound was reached, or the tip was withdrawn."""
-        if self._control.was_lost:
-            raise ControlLost(f"control was lost while z was held: {self._control.why_lost}", where=self._link.name)
+        self._require_control()
         if not self._commands.value(names.Z_IS_HELD, None, self._until_s):
             self._end()
 
     def release(self) -> None:
-        """Begin the way back, and return when the feedback is on; without control the scheduler has begun it already.
+        """Begin the way back, and return when the feedback is on.
 
         Raises:
+            ControlLost: z was held no more, since the scheduler has begun the way back.
             Refused: z was held no more, or the way back failed; the reason says why.
         """
-        if not self._control.held:
-            return
+        self._require_control()
         self._end()
         if not self._commands.value(names.FEEDBACK_ON, None, self._until_s):
             self._end()
+
+    def _require_control(self) -> None:
+        if self._control.was_lost:
+            raise ControlLost(f"control was lost while z was held: {self._control.why_lost}", where=self._link.name)
 
     def _end(self) -> None:
         states = self._link.view.count("ScopeStateMsg")

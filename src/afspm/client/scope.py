@@ -407,8 +407,8 @@ class Scope(ExperimentView):
         The feedback is switched off and read as off, then the bias is set, then z is moved. The block may take scans
         and spectra, read values, and move on by `held.move`. At its end, also by an error, the translator sets back z,
         then bias, setpoint and gains, and switches the feedback on. It does so by itself if the component ends or loses
-        control, which raises ControlLost at the next call, and if a bound is reached, which raises Refused. Where the
-        way back fails, the feedback stays off, and the tip is withdrawn.
+        control, which raises ControlLost at the next call or at the end of the block, and if a bound is reached, which
+        raises Refused. Where the way back fails, the feedback stays off, and the tip is withdrawn.
 
         Args:
             offset: height in m or as text, negative towards the sample, which a limit on `x-held-z-offset` must allow.
