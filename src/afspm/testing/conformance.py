@@ -121,6 +121,14 @@ class CheckResult:
         return (self.line, *(re.sub(r"\d+", "#", text) for text in self.complaints))
 
 
+def counted(lines: Iterable[str]) -> list[str]:
+    """Return each line once, with its number of occurrences; lines that differ only in numbers count as equal."""
+    found: dict[str, list[str]] = {}
+    for line in lines:
+        found.setdefault(re.sub(r"\d+", "#", line), []).append(line)
+    return [same[0] + (f" ({len(same)} times)" if len(same) > 1 else "") for same in found.values()]
+
+
 def expect(holds: object, expected: str, came: str) -> None:
     if not holds:
         raise Failed(expected, came)

@@ -100,7 +100,7 @@ class Processes:
                 level, text = self._readers[event.name].read(event.stream, event.line)
                 self._write(event.name, level, text)
                 if level >= logging.WARNING:
-                    self._complaints.append(f"{event.name}: {text}")
+                    self._complaints.append(f"{event.name}: {logging.getLevelName(level)} {text}")
             case Exited():
                 error = self._readers[event.name].last_error
                 self._ended[event.name] = f"{describe_exit(event.code)}{f' ({error})' if error else ''}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
 from pathlib import Path
@@ -14,6 +15,7 @@ from rich.console import Console
 from afspm.model import ScopeState, ScopeStatus
 from afspm.testing.conformance import CheckOutcome, show_result
 from afspm.testing.translators import CheckOptions, CheckReport, client, run
+from afspm.testing.translators.checks import scans
 from afspm.testing.translators.session import SPEED
 
 HERE = Path(__file__).parent
@@ -152,3 +154,24 @@ def test_setting_that_cannot_be_restored_is_reported(tmp_path: Path) -> None:
     assert not report.passed
     written = json.loads((Path(report.folder) / "report.json").read_text(encoding="utf-8"))
     assert written["unrestored"] == report.unrestored
+
+
+# makers C1: 75 checks passed
+def test_stop_without_effect_is_no_stop_and_the_report_ends_with_the_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scans, "STOPPED_REAL_S", 4.0)
+    file = tmp_path / "experiment.toml"
+    controller = '[controller]\ncomponent = true\nclass = "NanonisEmulator"\nas_reported = ["deaf-stop"]\n'
+    file.write_text(f'{controller}\n[microscope]\ncomponent = true\nclass = "Nanonis"\n', encoding="utf-8")
+    report = run(CheckOptions([file], runs=tmp_path / "runs", only=["scan/cancel"]))
+    (failure,) = report.failed
+    assert re.search(r"expected SS_FREE within .* s of stop-scan; came .* s, of a scan of 80 s", failure.line)
+    logged = json.loads((Path(report.folder) / "report.json").read_text(encoding="utf-8"))["logged"]
+    assert any(line.startswith("controller: WARNING SIMULATED") for line in logged), logged
+
+
+@pytest.mark.parametrize(("left_s", "busy_s", "idle_s"), [(39.0, 19.5, 5.0), (6.0, 3.0, 3.0), (None, math.inf, 5.0)])
+def test_stop_ends_a_scan_well_before_its_own_end(left_s: float | None, busy_s: float, idle_s: float) -> None:
+    assert scans.longest_stop_s(left_s, is_simulated=True) == busy_s
+    assert scans.longest_stop_s(left_s, is_simulated=False) == idle_s

@@ -26,6 +26,7 @@ from afspm.testing.conformance import (
     SuiteReport,
     Unsupported,
     attempt,
+    counted,
     expect,
     show_failures,
     show_result,
@@ -80,6 +81,10 @@ def test_outcome_and_line_follow_from_the_exception_of_a_check(check: Check, out
     assert (result.name, result.outcome, result.line) == (check.name, outcome, line)
     assert bench.explained == ([check.name] if check.name in ("bad", "excused") else [])
     assert bool(result.complaints) == (outcome is CheckOutcome.FAILED)
+
+
+def test_lines_that_differ_in_numbers_are_counted_once() -> None:
+    assert counted(["late by 3 s", "lost", "late by 41 s"]) == ["late by 3 s (2 times)", "lost"]
 
 
 def test_error_of_a_check_itself_is_no_verdict() -> None:

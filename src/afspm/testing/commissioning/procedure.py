@@ -20,7 +20,7 @@ from afspm.testing.commissioning.maker_claims import MakerClaim
 from afspm.testing.commissioning.progress import CommissioningProgress
 from afspm.testing.commissioning.report import InstrumentReport, steps_of
 from afspm.testing.commissioning.steps import WITHDRAWN, all_steps
-from afspm.testing.conformance import CheckOutcome, CheckResult, Failed, Lost, Skipped, attempt, mark
+from afspm.testing.conformance import CheckOutcome, CheckResult, Failed, Lost, Skipped, attempt, counted, mark
 from afspm.testing.translators.client import value_in
 from afspm.testing.translators.report import CheckReport
 from afspm.testing.translators.runner import restored
@@ -132,6 +132,8 @@ def _in_session(
         write()
         for line in checks.unrestored:
             prompts.show(f"not put back: {line}")
+        for line in counted(checks.complaints):
+            prompts.show(f"logged: {line}")
 
 
 class _Walk:
@@ -240,4 +242,5 @@ def _report(session: CheckSession, checks: CheckReport, result: CommissioningRes
         claims=result.claims,
         unsupported=lacking,
         unrestored=checks.unrestored,
+        logged=counted(checks.complaints),
     )

@@ -37,6 +37,7 @@ class InstrumentReport:
         claims: the verdicts on claims about the maker's program that steps settle, by id; see `MakerClaim`.
         unsupported: actions and parameters that the controller does not have.
         unrestored: settings that could not be restored.
+        logged: the warnings and errors in the log of the last evening, each once with a count.
     """
 
     maker: str
@@ -51,6 +52,7 @@ class InstrumentReport:
     claims: Mapping[str, str] = field(default_factory=dict)
     unsupported: Sequence[str] = ()
     unrestored: Sequence[str] = ()
+    logged: Sequence[str] = ()
     note: str = ""
     format: int = FORMAT
 

@@ -356,7 +356,7 @@ def _stop(guide: Guide) -> str:
 )
 def _stop_at_panel(guide: Guide) -> str:
     client = guide.kit.client
-    mark = guide.kit.begin_long_scan(guide.kit.frames.other)
+    mark, _ = guide.kit.begin_long_scan(guide.kit.frames.other)
     reply = guide.prompts.text("Stop the scan at the panel, then press Enter (u: it can't be stopped there)")
     if reply.strip():
         client.come_to_rest()

@@ -117,6 +117,8 @@ LINE_S = 0.25
 """Least experiment seconds of a line, trace and retrace, far from the limits of any scanner."""
 LONG_REAL_S = 3.0
 """Least real seconds of a scan during which requests are sent."""
+STOPPED_REAL_S = 40.0
+"""Real seconds of a scan that is stopped: it must not end by itself while a busy computer notices its stop."""
 UNKNOWN_S = 1200.0
 """Experiment seconds after which a scan or spectrum of unknown duration counts as endless."""
 
@@ -246,11 +248,11 @@ class CheckMeasurements:
             raise Failed("a Scan2d between SS_SCANNING and SS_FREE", describe_all(observed))
         return Taken(frame, observed, expected_s)
 
-    def begin_long_scan(self, frame: FrameSetting) -> int:
-        """Start a scan long enough for other requests; return the mark before it."""
-        long_real_s = LONG_REAL_S * self.client.patience
-        self.prepare(frame, max(SCAN_S, long_real_s / self.client.clock.real_s(1.0)))
-        return self._begin(names.START_SCAN, ScopeState.SCANNING)
+    def begin_long_scan(self, frame: FrameSetting, lasts_real_s: float = 0.0) -> tuple[int, float | None]:
+        """Start a scan long enough for other requests; return the mark before it, and its duration as `prepare`."""
+        lasts_real_s = max(LONG_REAL_S * self.client.patience, lasts_real_s)
+        expected_s = self.prepare(frame, max(SCAN_S, lasts_real_s / self.client.clock.real_s(1.0)))
+        return self._begin(names.START_SCAN, ScopeState.SCANNING), expected_s
 
     def prepare(self, frame: FrameSetting, lasts_s: float) -> float | None:
         """Set frame and speed for a scan of `lasts_s`.

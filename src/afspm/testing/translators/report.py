@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from rich.box import SIMPLE_HEAD
@@ -10,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from afspm.model import names
-from afspm.testing.conformance import SuiteReport, show_failures, show_verdict
+from afspm.testing.conformance import SuiteReport, counted, show_failures, show_verdict
 from afspm.testing.translators.session import CheckSession
 from afspm.testing.translators.support import Support
 
@@ -22,17 +23,19 @@ class CheckReport(SuiteReport):
     Attributes:
         translator: class or command of the translator.
         unrestored: settings that could not be restored, one per line.
+        complaints: the logged warnings and errors; the list grows.
     """
 
     translator: str = ""
     simulated: bool = False
     support: Support = field(default_factory=Support)
     unrestored: list[str] = field(default_factory=list)
+    complaints: Sequence[str] = ()
 
     def describe(self, session: CheckSession) -> None:
         """Record the facts about the translator under test."""
         self.translator, self.simulated = session.translator, session.simulated
-        self.support, self.folder = session.support, str(session.folder)
+        self.support, self.folder, self.complaints = session.support, str(session.folder), session.complaints
 
     @property
     def passed(self) -> bool:
@@ -45,6 +48,7 @@ class CheckReport(SuiteReport):
             "simulated": self.simulated,
             "unrestored": self.unrestored,
             "wrong_answers": self.support.errors,
+            "logged": counted(self.complaints),
             "actions": [{"name": name, "supported": has} for name, has in self.support.actions.items()],
             "parameters": [self._parameter(name) for name in self.support.parameters],
         }
@@ -78,6 +82,8 @@ def show_end(report: CheckReport, console: Console) -> None:
     for what, lines in (("wrong answer", report.support.errors), ("not restored", report.unrestored)):
         for line in lines:
             console.print(Text(f"{what}: {line}", "bold red"), soft_wrap=True)
+    for line in counted(report.complaints):
+        console.print(Text(f"logged: {line}", "yellow"), soft_wrap=True)
     unsupported = sum(value is None for value in report.support.parameters.values())
     unsupported += sum(has is False for has in report.support.actions.values())
     verdict = "the translator passes the suite" if report.passed else "the translator fails the suite"

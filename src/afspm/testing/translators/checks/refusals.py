@@ -116,7 +116,7 @@ _NEEDS = (names.START_SCAN, names.STOP_SCAN)
 
 @check("busy/refused", "during a scan, requests that would disturb it get REP_NOT_FREE, and it goes on", needs=_NEEDS)
 def refused(kit: CheckMeasurements) -> None:
-    mark = kit.begin_long_scan(kit.frames.other)
+    mark, _ = kit.begin_long_scan(kit.frames.other)
     asked: list[tuple[ControlRequest, object, str, tuple[str, ...]]] = [
         (ControlRequest.ACTION, names.START_SCAN, "start-scan", ()),
         (ControlRequest.ACTION, names.START_SPEC, "start-spec", (names.START_SPEC,)),
@@ -143,7 +143,7 @@ def refused(kit: CheckMeasurements) -> None:
 
 @check("busy/answered", "during a scan, questions for parameters and supported actions are answered", needs=_NEEDS)
 def answered(kit: CheckMeasurements) -> None:
-    mark = kit.begin_long_scan(kit.frames.other)
+    mark, _ = kit.begin_long_scan(kit.frames.other)
     name = next((one for one, value in kit.support.parameters.items() if value is not None), None)
     asked: list[tuple[ControlRequest, object, str]] = []
     if kit.support.actions[names.STOP_SCAN] is not None:

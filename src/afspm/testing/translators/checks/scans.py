@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from afspm.model import Scan, ScanParameters, ScopeState, ScopeStatus, names
 from afspm.testing.conformance import Failed, Skipped, expect
 from afspm.testing.translators.client import Observation, describe_all, scans, states
-from afspm.testing.translators.measuring import SCAN_S, CheckMeasurements, Taken, difference
+from afspm.testing.translators.measuring import SCAN_S, STOPPED_REAL_S, CheckMeasurements, Taken, difference
 from afspm.testing.translators.translator_suite import check
 
-
-def broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> list[Observation]:
-    """Stop the activity, check its states, and return its publications."""
-    stop_by_request(kit, mark, stop, begun)
-    return require_broken_off(kit, mark, stop, begun)
+_STOPPED_S = 5.0
+"""Longest time from the answer to a stop until the controller is free: a line may have to be finished first."""
 
 
 def stop_by_request(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> float:
@@ -45,8 +44,27 @@ def require_broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: Scop
     needs=(names.START_SCAN, names.STOP_SCAN),
 )
 def cancel(kit: CheckMeasurements) -> None:
-    observed = broken_off(kit, kit.begin_long_scan(kit.frames.other), names.STOP_SCAN, ScopeState.SCANNING)
+    client = kit.client
+    mark, lasts_s = kit.begin_long_scan(kit.frames.other, STOPPED_REAL_S)
+    answered_s = stop_by_request(kit, mark, names.STOP_SCAN, ScopeState.SCANNING)
+    client.wait_state(ScopeState.INTERRUPTED, mark)
+    # as long as the scan itself: without a stop it is free at the end of the scan, on a busy computer, too
+    client.wait_state(ScopeState.FREE, mark, client.real_s(60.0 + (lasts_s or 0.0)))
+    taken = Taken(None, client.observations.since(mark), lasts_s)
+    left_s = None if lasts_s is None else taken.time_s(ScopeState.SCANNING) + lasts_s - answered_s
+    is_simulated = client.clock.real_s(1.0) < 1.0 or client.patience > 1.0
+    most_s = longest_stop_s(left_s, is_simulated=is_simulated)
+    stopped_s = taken.time_s(ScopeState.FREE) - answered_s
+    whole = "" if lasts_s is None else f", of a scan of {lasts_s:.3g} s"
+    expect(stopped_s <= most_s, f"SS_FREE within {most_s:.3g} s of {names.STOP_SCAN}", f"{stopped_s:.3g} s{whole}")
+    observed = require_broken_off(kit, mark, names.STOP_SCAN, ScopeState.SCANNING)
     expect(not scans(observed), "no Scan2d of a scan that was stopped", describe_all(observed))
+
+
+def longest_stop_s(left_s: float | None, *, is_simulated: bool) -> float:
+    """Return the longest experiment time from a stop until SS_FREE, in a scan that would go on for `left_s`."""
+    half_s = math.inf if left_s is None else left_s / 2.0
+    return half_s if is_simulated else min(half_s, _STOPPED_S)  # a busy computer makes the stop of an emulator late
 
 
 @check("scan/stop-nothing", "stop-scan while nothing runs succeeds, and changes nothing", needs=(names.STOP_SCAN,))
