@@ -49,6 +49,13 @@ class OtherZNanonis(Nanonis):
         return (-found[0],) if name == "ZCtrl.ZPosGet" else found  # type: ignore[operator]
 
 
+class DeafNanonis(Nanonis):
+    """A withdrawal has no effect, without an error."""
+
+    def _ask(self, name: str, *arguments: object, longer_s: float = 0.0) -> tuple[Any, ...]:
+        return () if name == "ZCtrl.Withdraw" else super()._ask(name, *arguments, longer_s=longer_s)
+
+
 class NoLinesNanonis(Nanonis):
     """The lines of a running scan can't be read."""
 

@@ -35,6 +35,7 @@ from afspm.testing.commissioning.procedure import REHEARSAL_PATIENCE, Commission
 from afspm.testing.commissioning.report import InstrumentReport
 from afspm.testing.conformance import CheckOutcome
 from afspm.testing.translators import CheckOptions
+from afspm.testing.translators.checks import scans
 from afspm.translator.trace import FILE, TracedExchange, read_trace
 
 HERE = Path(__file__).parent
@@ -47,7 +48,7 @@ component = true
 class = "{vendor}Emulator"
 surface = "particles"
 seed = 7
-
+{controller}
 [microscope]
 component = true
 class = "{driver}"
@@ -93,10 +94,12 @@ def commissioned(
     *,
     patience: float = REHEARSAL_PATIENCE,
     settings: str = "",
+    controller: str = "",
 ) -> CommissioningResult:
     shutil.copy(HERE / "spoiled.py", folder)
     file = folder / "experiment.toml"
-    file.write_text(EXPERIMENT.format(vendor=vendor, driver=driver or vendor) + settings, encoding="utf-8")
+    text = EXPERIMENT.format(vendor=vendor, driver=driver or vendor, controller=controller)
+    file.write_text(text + settings, encoding="utf-8")
     report = folder / "report.toml"
     before = InstrumentReport.read(report) if report.exists() else None
     options = CheckOptions([file], runs=folder / "runs", patience=patience)
@@ -113,6 +116,7 @@ def test_a_controller_that_is_right_passes_and_the_report_says_what_was_tried(ve
     assert report.tried_on == "emulator"
     assert report.operations["scan"] == report.operations["axes"] == report.operations["stop"] == "passed", lines
     assert vendor != "Nanonis" or report.claims["withdrawn-limit"] == "holds"
+    assert ("on your word alone" in lines["withdrawn"]) is (vendor not in ("Nanonis", "Asylum")), lines
     exchanges = [one for one in read_trace(result.folder / FILE) if isinstance(one, TracedExchange)]
     assert any("start-scan" in one.command for one in exchanges)
 
@@ -238,13 +242,46 @@ def test_ctrl_c_in_contact_withdraws_the_tip(tmp_path: Path) -> None:
     assert not InstrumentReport.read(tmp_path / "report.toml").unrestored
 
 
-def test_z_that_counts_the_other_way_is_found_by_the_withdrawal(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+# makers C3: 14 of 14 steps ran
+@pytest.mark.parametrize(("driver", "withdrawn"), [("", "false"), ("spoiled.OtherZNanonis", "true")])
+def test_tip_that_reads_as_at_the_sample_is_not_believed_to_be_withdrawn(
+    driver: str, withdrawn: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     person = Person()
-    result = commissioned(tmp_path, "Nanonis", person, "spoiled.OtherZNanonis")
+    result = commissioned(tmp_path, "Nanonis", person, driver, controller=f"withdrawn = {withdrawn}\n")
+    found = result.progress.results["withdrawn"]
+    assert found.outcome is CheckOutcome.FAILED
+    assert "expected the tip withdrawn, as you say; came x-engaged reads true" in found.line
+    assert "or z counts the other way" in found.line
+    assert any("What to do: Withdraw the tip at the panel" in line for line in person.shown)
+    assert result.progress.results["frame"].outcome is CheckOutcome.BLOCKED
+    exchanges = [one for one in read_trace(result.folder / FILE) if isinstance(one, TracedExchange)]
+    assert not [one.what for one in exchanges if one.command]
+
+
+# makers C1: the scan of 8 s ended by itself, which passed as a stop
+def test_stop_without_effect_is_found_and_the_report_ends_with_the_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scans, "STOPPED_REAL_S", 8.0)
+    person = Person()
+    result = commissioned(tmp_path, "Nanonis", person, patience=1.0, controller='as_reported = ["deaf-stop"]\n')
+    found = result.progress.results["stop"]
+    assert found.outcome is CheckOutcome.FAILED, found
+    assert re.search(r"expected SS_FREE within .* s of stop-scan; came .* s, of a scan of 160 s", found.line)
+    assert any("Do not leave this controller alone" in line for line in person.shown)
+    logged = InstrumentReport.read(tmp_path / "report.toml").logged
+    assert any("the measurement is in the air (" in line for line in logged), "once, with a count"
+    assert [line for line in person.shown if line.startswith("logged: ")] == [f"logged: {line}" for line in logged]
+
+
+def test_withdrawal_without_effect_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    person = Person()
+    result = commissioned(tmp_path, "Nanonis", person, "spoiled.DeafNanonis")
     assert not result.passed
     assert "z counts the other way at this rig" in result.progress.results["x-retract"].line
     assert result.claims["withdrawn-limit"] == "does not hold"
@@ -296,7 +333,9 @@ def test_a_lost_connection_is_noticed_and_found_again(tmp_path: Path) -> None:
 
 def ask(folder: Path, driver: str, *answers: str) -> subprocess.CompletedProcess[str]:
     shutil.copy(HERE / "spoiled.py", folder)
-    (folder / "experiment.toml").write_text(EXPERIMENT.format(vendor="Nanonis", driver=driver), encoding="utf-8")
+    (folder / "experiment.toml").write_text(
+        EXPERIMENT.format(vendor="Nanonis", driver=driver, controller=""), encoding="utf-8"
+    )
     return subprocess.run(
         [sys.executable, "-c", "from afspm.cli import main; main()", "commission", "experiment.toml"],
         input="\n".join(answers) + "\n",
@@ -333,7 +372,7 @@ def test_a_rehearsal_is_patient_with_a_busy_computer(tmp_path: Path) -> None:
 
 def test_the_end_of_the_answers_ends_it_safely(tmp_path: Path) -> None:
     file = tmp_path / "experiment.toml"
-    file.write_text(EXPERIMENT.format(vendor="Gxsm", driver="Gxsm"), encoding="utf-8")
+    file.write_text(EXPERIMENT.format(vendor="Gxsm", driver="Gxsm", controller=""), encoding="utf-8")
     done = subprocess.run(
         [sys.executable, "-c", "from afspm.cli import main; main()", "commission", "experiment.toml"],
         input="y\n",
@@ -350,7 +389,7 @@ def test_the_end_of_the_answers_ends_it_safely(tmp_path: Path) -> None:
 @can_interrupt
 def test_ctrl_c_at_a_question_ends_it_with_the_report_written(tmp_path: Path) -> None:
     file = tmp_path / "experiment.toml"
-    file.write_text(EXPERIMENT.format(vendor="Nanonis", driver="Nanonis"), encoding="utf-8")
+    file.write_text(EXPERIMENT.format(vendor="Nanonis", driver="Nanonis", controller=""), encoding="utf-8")
     command = [sys.executable, "-c", "from afspm.cli import main; main()", "commission", "experiment.toml"]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, cwd=tmp_path, stdin=pipe, stdout=pipe, encoding="utf-8") as process:

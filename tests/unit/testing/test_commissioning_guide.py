@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 
+from afspm.model import Parameter, names
 from afspm.testing.commissioning.guide import UNSEEN, Guide
-from afspm.testing.commissioning.steps import all_steps
+from afspm.testing.commissioning.steps import all_steps, tip_shown
 from afspm.testing.conformance import Failed, Skipped, Unsupported
 from afspm.testing.translators.support import Support
 
@@ -42,6 +43,29 @@ class Person:
 def guide(person: Person, *, has_panel: bool, has_tip: bool = True) -> Guide:
     kit: Any = SimpleNamespace(support=Support({}, {}))
     return Guide(kit, person, Path(), has_panel=has_panel, has_tip=has_tip)
+
+
+# makers C3
+@pytest.mark.parametrize(
+    ("engaged", "current_a", "setpoint", "shown"),
+    [
+        (None, None, ("1e-10", "A"), None),
+        (None, "9e-11", ("1e-10", "V"), None),
+        (None, "4e-12", ("100", "pA"), None),
+        (None, "-9e-11", ("100", "pA"), True),
+        (None, "0", ("0", "A"), None),
+        ("false", None, None, False),
+        ("false", "9e-11", ("1e-10", "A"), True),
+        ("true", "1e-15", ("1e-10", "A"), True),
+    ],
+)
+def test_tip_is_at_the_sample_where_its_switch_or_its_current_shows_it(
+    engaged: str | None, current_a: str | None, setpoint: tuple[str, str] | None, shown: bool | None
+) -> None:
+    read = {names.ENGAGED: (engaged, None), names.CURRENT: (current_a, "A"), names.ZCTRL_SETPOINT: setpoint}
+    found, words = tip_shown({name: Parameter(name, *one) for name, one in read.items() if one and one[0]})
+    assert found is shown
+    assert ("x-engaged reads" in words) is (engaged is not None)
 
 
 PANEL_QUESTIONS: dict[str, Callable[[Guide], object]] = {

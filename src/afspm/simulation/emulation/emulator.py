@@ -11,7 +11,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, ClassVar
@@ -94,6 +94,7 @@ class Emulator(ABC):
         as_reported: what others report of real controllers (`reported`): True for all of it, or a list of names.
         faults: each a text as on the command line (`KIND[@SECONDS][,count=N][,duration=SECONDS]`) or a table of
             `kind`, `at_s`, `count`, `duration_s`.
+        withdrawn: True if the tip is withdrawn at the beginning, with the feedback off.
         surface: a kind of sample, or a table of `kind` and its settings.
         tip, tip_changes, drift, feedback, scanner, noise, signals, iv, force, z, property_map: settings of the
             simulated world, as in `World.from_settings`. The scanner may be a name: "stm-4k".
@@ -149,6 +150,7 @@ class Emulator(ABC):
         dates_files: bool = False,
         as_reported: bool | Sequence[str] = False,
         faults: Sequence[str | PlainMapping | Fault] = (),
+        withdrawn: bool = False,
         surface: str | PlainMapping = "steps",
         tip: PlainMapping | None = None,
         tip_changes: PlainMapping | None = None,
@@ -164,7 +166,7 @@ class Emulator(ABC):
     ) -> None:
         self.port = port
         self.seed = seed
-        self._clock_off_s, self._dates_files = clock_off_s, dates_files
+        self._clock_off_s, self._dates_files, self._withdrawn = clock_off_s, dates_files, withdrawn
         self.as_reported = self._chosen(as_reported)
         world = {
             "surface": surface,
@@ -298,6 +300,8 @@ class Emulator(ABC):
         self.rig = SimulatedInstrument(
             self._world_settings, self.seed, clock.now_s(), run=in_background, note=truth.note
         )
+        if self._withdrawn:
+            self.rig.engaged, self.rig.setup.feedback = False, replace(self.rig.setup.feedback, on=False)
         truth.note(clock.now_s(), "start", {"settings": self._world_settings, "seed": self.seed})
         self.faults = Faults(self._faults, self.all_faults(), clock.now_s())
         self.file_clock = ControllerClock(self._clock_off_s, dates_files=self._dates_files)

@@ -46,6 +46,7 @@ class Guide:
         has_lines: False for a controller whose lines are not published while it scans.
         program_s: real seconds that the controller's program may need beside measuring; see `Driver.program_s`.
         counts_clockwise: True if the controller's panel shows angles clockwise.
+        approaches: True for a simulated tip, which no person can bring to the sample.
         in_contact: True if the person has approached the tip, which is withdrawn after the steps at the sample.
         claims: the driver's claims about the maker's program, by id.
         seen: the observations that settle claims, by the names in `MakerClaim.commission`: True if the claim holds.
@@ -60,6 +61,7 @@ class Guide:
     has_lines: bool = True
     program_s: float = 0.0
     counts_clockwise: bool = False
+    approaches: bool = False
     in_contact: bool = False
     claims: Mapping[str, MakerClaim] = field(default_factory=dict)
     seen: dict[str, bool] = field(default_factory=dict)

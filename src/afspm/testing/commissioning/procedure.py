@@ -121,6 +121,7 @@ def _in_session(
                 has_lines=_interval_of_lines(session.options) is not None,
                 program_s=session.program_s,
                 counts_clockwise=session.counts_clockwise,
+                approaches=session.simulated,
                 claims=claims,
             )
             walk = _Walk(guide, result, write)
@@ -201,7 +202,20 @@ def _traced(options: CheckOptions, stack: ExitStack) -> CheckOptions:
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
     overlay = trace_overlay(prepare(options).resolved, folder)
     traced = options if overlay is None else replace(options, files=[*options.files, overlay])
-    return _with_lines(traced, folder)
+    return _with_lines(_with_tip_away(traced, folder), folder)
+
+
+def _with_tip_away(options: CheckOptions, folder: Path) -> CheckOptions:
+    # a rehearsal begins as an evening does, unless its file says where the tip is
+    resolved = prepare(options).resolved
+    name = next((name for name in resolved.emulators if name not in options.without), "")
+    abilities = resolved.with_role(Role.TRANSLATOR)[0].capabilities()
+    shows_tip = abilities is not None and names.ENGAGED in abilities.parameters
+    if not name or not shows_tip or "withdrawn" in resolved.processes[name].settings:
+        return options
+    overlay = folder / "withdrawn.toml"
+    overlay.write_text(f"[{name}]\nwithdrawn = true\n", encoding="utf-8")
+    return replace(options, files=[*options.files, overlay])
 
 
 def _with_lines(options: CheckOptions, folder: Path) -> CheckOptions:

@@ -6,15 +6,17 @@ Each step returns a line with its observation, or raises Failed, Skipped or Decl
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from afspm.basics.formatting import quantity
+from afspm.basics.units import same_kind
 from afspm.drawing import raster
 from afspm.model import ChannelRoles, ControlRequest, Feedback, RegionChange, Scan, ScanParameters, ScopeState, names
+from afspm.model.requests import Parameter
 from afspm.testing.commissioning import lines_in_scan
 from afspm.testing.commissioning.guide import Guide
 from afspm.testing.commissioning.progress import CommissioningStep
@@ -22,7 +24,7 @@ from afspm.testing.conformance import Declined, Lost, Skipped, expect
 from afspm.testing.translators.checks import frames, picture, scans
 from afspm.testing.translators.client import describe_all
 from afspm.testing.translators.client import scans as published
-from afspm.testing.translators.measuring import SCAN_S, FrameSetting, Taken, number
+from afspm.testing.translators.measuring import SCAN_S, STOPPED_REAL_S, FrameSetting, Taken, number
 
 READ, FRAME, ANGLE, SCAN, END, FILES, STOP, LOSS, AXES = (
     "read", "frame", "angle", "scan", "end of a scan", "files", "stop", "lost connection", "axes",
@@ -156,7 +158,8 @@ def _safe_tip(guide: Guide) -> str:
 @_step(
     "The tip is withdrawn",
     "The next steps, up to the next notice, move the scanner sideways and take scans. They never approach.",
-    "Withdraw the tip with the coarse motor, so far that the scanner can't reach the sample, and begin again.",
+    "Withdraw the tip at the panel, then with the coarse motor, so far that the scanner can't reach the sample, and "
+    "begin again.",
     after=("controller",),
     moves=False,
     about_tip=True,
@@ -165,7 +168,35 @@ def _safe_tip(guide: Guide) -> str:
 def _withdrawn(guide: Guide) -> str:
     if not guide.prompts.confirm("Is the tip so far from the sample that the scanner can't reach it?"):
         raise Declined("the tip is not withdrawn")
-    return "confirmed"
+    return _agreed(guide, at_sample=False)
+
+
+def _agreed(guide: Guide, *, at_sample: bool) -> str:
+    # the line of a step in which the person says where the tip is; raises Failed if the controller shows otherwise
+    wanted = (name for name in (names.ENGAGED, names.CURRENT, names.ZCTRL_SETPOINT) if guide.kit.support.has(name))
+    shown, reading = tip_shown({name: guide.kit.client.get(name) for name in wanted})
+    if shown is None:
+        return f"on your word alone: {reading or 'this controller does not show where its tip is'}"
+    hint = "" if at_sample else ": the tip is at the sample, or z counts the other way and it never reads withdrawn"
+    said = f"the tip {'at the sample' if at_sample else 'withdrawn'}, as you say"
+    expect(shown is at_sample, said, reading + hint)
+    return f"confirmed: {reading}"
+
+
+def tip_shown(read: Mapping[str, Parameter]) -> tuple[bool | None, str]:
+    """Return whether readings show the tip at the sample, and in words which; None if they do not show it.
+
+    A current of half the setpoint flows at the sample only. A smaller one shows nothing: the feedback may be off.
+    """
+    engaged, current, setpoint = (read.get(name) for name in (names.ENGAGED, names.CURRENT, names.ZCTRL_SETPOINT))
+    found = None if engaged is None else engaged.value == "true"
+    words = [] if engaged is None else [f"{names.ENGAGED} reads {engaged.value}"]
+    if current is not None and setpoint is not None and same_kind(setpoint.unit or "", "A"):
+        current_a, setpoint_a = number(current, "A"), number(setpoint, "A")
+        words.append(f"{names.CURRENT} reads {quantity(current_a, 'A')}, the setpoint {quantity(setpoint_a, 'A')}")
+        if abs(current_a) >= abs(setpoint_a) / 2.0 > 0.0:
+            found = True
+    return found, ", ".join(words)
 
 
 @_step(
@@ -356,7 +387,7 @@ def _stop(guide: Guide) -> str:
 )
 def _stop_at_panel(guide: Guide) -> str:
     client = guide.kit.client
-    mark, _ = guide.kit.begin_long_scan(guide.kit.frames.other)
+    mark, _ = guide.kit.begin_long_scan(guide.kit.frames.other, STOPPED_REAL_S)  # a person needs time to click
     reply = guide.prompts.text("Stop the scan at the panel, then press Enter (u: it can't be stopped there)")
     if reply.strip():
         client.come_to_rest()
@@ -412,10 +443,14 @@ def _contact(guide: Guide) -> str:
     if not guide.prompts.confirm("Is the tip at the sample, and the feedback stable?"):
         raise Declined("the tip stays withdrawn")
     guide.in_contact = True
+    if guide.approaches and guide.kit.support.has(names.ENGAGE, names.ENGAGED):
+        mark = guide.kit.client.observations.mark()
+        guide.kit.act(names.ENGAGE)  # no hand can bring a simulated tip to its sample
+        guide.kit.client.settled(mark, awaiting=ScopeState.FREE)
     expect(guide.kit.support.has(names.STOP_SCAN), "a controller whose scans can be stopped", "they can't be")
     feedback = guide.kit.client.observations.newest(Feedback)
     expect(feedback is None or feedback.on is not False, "the feedback on", "it is off")
-    return "confirmed"
+    return _agreed(guide, at_sample=True)
 
 
 @_step(
