@@ -13,7 +13,6 @@ import select
 import signal
 import socket
 import struct
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +85,7 @@ class MemoryClient:
     def call(self, method: str, *arguments: Any) -> Any:
         import fcntl
 
-        with Path(tempfile.gettempdir(), "gxsm4_pyshm_transaction.lock").open("a") as lock:
+        with Path("/tmp/gxsm4_pyshm_transaction.lock").open("a") as lock:
             if self._locked:
                 fcntl.flock(lock, fcntl.LOCK_EX)
             self.ask(method, *arguments)

@@ -377,6 +377,37 @@ def test_a_gxsm_that_ends_during_a_call_is_noticed_at_once(block: Path) -> None:
         assert status(block) == 0
 
 
+CALLS = """
+import sys, time
+from afspm.plugins.gxsm.link import Address, open_link
+open_link(Address.parse(sys.argv[1]), float(sys.argv[2]), time.monotonic).call("get", "RangeX")
+"""
+
+
+@pytest.mark.parametrize("named", ["", "of-all-callers.lock"])
+def test_callers_with_other_temporary_folders_share_one_lock(block: Path, tmp_path: Path, named: str) -> None:
+    # results R7
+    lock = str(tmp_path / named) if named else ""
+
+    def caller(timeout_s: float, folder: Path) -> subprocess.Popen[bytes]:
+        folder.mkdir()
+        command = [sys.executable, "-c", CALLS, f"shm:{block.name}@{gxsm.pid}", str(timeout_s)]
+        environment = {**os.environ, "GXSM_PYSHM_LOCK_FILE": lock, "TMPDIR": str(folder)}
+        return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE)
+
+    shows = [sys.executable, "-c", LISTENS.replace("lambda *_: None", "lambda *_: print(flush=True)")]
+    with subprocess.Popen(shows, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as gxsm:
+        assert gxsm.stdout is not None
+        gxsm.stdout.readline()
+        with caller(DEADLINE_S, tmp_path / "a") as first:
+            gxsm.stdout.readline()  # the first caller waits for its answer, and holds the lock
+            with caller(0.2, tmp_path / "b") as second:
+                complaint = second.communicate()[1].decode()
+            first.kill()
+        gxsm.kill()
+    assert f"{lock or '/tmp/gxsm4_pyshm_transaction.lock'}: another program keeps GXSM's shared memory" in complaint
+
+
 def test_too_small_memory_is_refused(block: Path) -> None:
     block.write_bytes(bytes(1000))
     command = [sys.executable, "-c", LISTENS]

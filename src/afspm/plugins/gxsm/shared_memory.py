@@ -12,7 +12,6 @@ import pickle
 import signal
 import struct
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -36,7 +35,9 @@ _FAILURES: Final = {
     -3: "wrong flags",
     -4: "GXSM has no such function",
 }
-_LOCK: Final = "gxsm4_pyshm_transaction.lock"
+# in no folder of `tempfile`: a caller with another TMPDIR would hold another lock
+_LOCK: Final = "/tmp/gxsm4_pyshm_transaction.lock"
+_LOCK_SETTING: Final = "GXSM_PYSHM_LOCK_FILE"
 _SOON_S, _LATER_S = 0.0001, 0.001
 _LOOKS_SOON: Final = 20
 
@@ -178,13 +179,16 @@ class SharedMemoryLink:
         # The lock of GXSM's own tools: two callers at once receive each other's answers.
         import fcntl
 
-        path = Path(tempfile.gettempdir()) / _LOCK
+        path = Path(os.environ.get(_LOCK_SETTING) or _LOCK)
         until_s = self._monotonic_s() + self._timeout_s
         try:
             file = path.open("a")
         except OSError as error:
+            hint = (
+                f"delete it, if no program uses it; or set {_LOCK_SETTING} to another file, for all of GXSM's callers"
+            )
             raise ControllerLost(
-                f"the lock file of GXSM's callers can't be opened: {error}", where=str(path)
+                f"the lock file of GXSM's callers can't be opened: {error}", where=str(path), hint=hint
             ) from error
         with file:
             while True:
