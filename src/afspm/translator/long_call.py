@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any, Final, Protocol
 
 from afspm.basics.errors import AfspmError, Refused
+from afspm.translator.driver_base import ControllerSilent
 
 ANSWERS_S: Final = 0.5
 """Real time within which a controller reports that it refuses a command; one that runs longer is a long command."""
+SHOWS_S: Final = 10.0
+"""Longest real time in which a controller shows nothing of a command that it has not answered either."""
 
 
 class LongLink(Protocol):
@@ -31,26 +35,45 @@ class LongCall:
     Args:
         what: the command, in words.
         is_unfinished: decides from the content of the reply whether the instrument still runs.
+        is_seen: returns whether the controller shows the command running; without it, `link` has answered a question.
 
     Attributes:
         value: the content of the reply, after its arrival.
     """
 
-    def __init__(self, what: str, link: LongLink, is_unfinished: Callable[[Any], bool] = lambda value: False) -> None:
+    def __init__(
+        self,
+        what: str,
+        link: LongLink,
+        is_unfinished: Callable[[Any], bool] = lambda value: False,
+        is_seen: Callable[[], bool] = lambda: True,
+    ) -> None:
         self.what = what
         self.value: Any = None
-        self._link, self._is_unfinished = link, is_unfinished
+        self._link, self._is_unfinished, self._is_seen = link, is_unfinished, is_seen
+        self._seen_s = time.monotonic()
         self._came = False
 
     def running(self) -> bool:
         """Return whether the command is still running.
 
         Raises:
-            the controller's error, or ControllerLost.
+            the controller's error, or ControllerLost; ControllerSilent: it shows nothing of the command for `SHOWS_S`.
         """
         if not self._came:
             self._came, self.value = self._link.reply(self.what)
+        if not self._came:
+            self._require_seen()
         return not self._came or self._is_unfinished(self.value)
+
+    def _require_seen(self) -> None:
+        # a controller that takes a command and loses it would be waited for without an end
+        now_s = time.monotonic()
+        if self._is_seen():
+            self._seen_s = now_s
+        elif now_s - self._seen_s >= SHOWS_S:
+            problem = f"the {self.what} has no answer, and has not run for {SHOWS_S:g} s: it never began, or is over"
+            raise ControllerSilent(problem, hint="look at the controller's screen, and at the tip")
 
     def require_accepted(self, failure: type[AfspmError], program: str, code: int) -> None:
         """Refuse the command if the controller has reported an error of the type `failure` already.

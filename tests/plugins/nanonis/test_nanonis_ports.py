@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import socket
 import time
 from collections.abc import Callable
 from typing import Any
 
+import pytest
 from deadlines import DEADLINE_S
 from tests.plugins.nanonis.nanonis_bench import Bench, Emulated
 from tests.plugins.vendor_bench import PATIENT, SOON, Peer, scanned, small
 
+from afspm.emulation import ClientConnection
 from afspm.model import ControlResponse, Scan, ScopeState, Spectrum, names
 from afspm.plugins.nanonis.emulator import DelayedReply
 
@@ -171,3 +174,51 @@ def test_tip_is_withdrawn_although_a_stop_can_not_be_read(bench: Make) -> None:
     made.strike("wedged", count=2)
     peer.until(UNDEFINED)
     assert withdraws_within(made, peer) < DEADLINE_S
+
+
+def second_port(made: Bench) -> int:
+    return int(made.address.split(",")[1])
+
+
+def at_second(made: Bench, do: Callable[[Emulated, ClientConnection], object]) -> None:
+    def job(emulated: Emulated) -> None:
+        port, there = second_port(made), emulated._server.connections
+        do(emulated, next(one for one in there if one.socket.getsockname()[1] == port))
+
+    made.at_panel(job)
+
+
+@pytest.mark.parametrize("ports", [3, 4])
+def test_port_that_another_program_holds_is_named_when_it_is_taken(bench: Make, ports: int) -> None:
+    # makers N1
+    made = bench(**REAL)
+    with socket.create_connection(("127.0.0.1", second_port(made)), DEADLINE_S):
+        peer = small(made, **named(made, ports))
+        made.until_logged("another program may hold this port, or it may be wedged until Nanonis is restarted")
+        made.until_logged(f"the next port is used in place of {second_port(made)}")
+        response = peer.act(names.START_SPEC)
+        assert response.ok == (ports > 3), response.reason
+        if response.ok:
+            peer.until(lambda one: isinstance(one, Spectrum))
+
+
+def test_curve_whose_start_is_lost_is_given_up(bench: Make) -> None:
+    # makers N1
+    made = bench(**REAL)
+    peer = small(made, **named(made, 3))
+    at_second(made, lambda emulated, connection: emulated._server.wedge(connection))
+    assert peer.act(names.START_SPEC).ok
+    made.until_logged("BiasSpectr.Start has no answer, and for 10 s no curve has run")
+    peer.until(ScopeState.INTERRUPTED)
+    peer.until(FREE)
+    assert "which a spectrum needs" in peer.act(names.START_SPEC).reason
+
+
+def test_curve_whose_answer_is_lost_is_published_from_its_file(bench: Make) -> None:
+    # makers N1
+    made = bench(**REAL)
+    peer = small(made, **named(made, 4))
+    assert peer.act(names.START_SPEC).ok
+    at_second(made, lambda _, connection: setattr(connection, "waits_for", DelayedReply(b"", 1e12)))
+    made.until_logged("BiasSpectr.Start has no answer, and for 10 s no curve has run")
+    peer.until(lambda one: isinstance(one, Spectrum))

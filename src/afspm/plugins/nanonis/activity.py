@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import ClassVar, Final
 
 from afspm.basics import Clock, Refused
-from afspm.driver import SCAN, Activity, ControllerLost, Kept, as_list, frame
+from afspm.driver import SCAN, Activity, ControllerLost, ControllerSilent, Kept, as_list, frame
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.plugins.nanonis.geometry import Probe, ScanFrame
 from afspm.plugins.nanonis.parameter_groups import TipState
@@ -17,7 +17,7 @@ from afspm.plugins.nanonis.result_files import NanonisFiles
 from afspm.plugins.nanonis.session import APPROACH, MODULES, CurveEnded, ListenerEvent, ScanEnded, Session
 
 _SHOWS_S: Final = 10.0
-"""Longest real time until a poll shows a started scan: the tip may first have to move to the first line."""
+"""Longest real time until a poll shows a started scan or curve: the tip may first have to move to the first line."""
 _LATEST_S: Final = 10.0
 """Experiment time from the expected arrival of the tip until the move counts as failed."""
 SAFE_TIP: Final = "Nanonis' safe tip withdrew the tip: find out why, then run x-engage to bring it back"
@@ -82,6 +82,7 @@ class NanonisActivity(Activity):
         self._kind_asked = kind
         same_name = ""
         self._listener.curve(MODULES[kind], same_name)
+        self._shows_until_s = self._clock.monotonic_s() + _SHOWS_S
         self._await_curve(f"{MODULES[kind]}.StatusGet")
 
     def begin(self, what: str) -> None:
@@ -264,11 +265,24 @@ class NanonisActivity(Activity):
     def _kind_running(self) -> str:
         # the blocking call on the second connection reports the end of the translator's own spectra
         if self._kind_asked:
+            self._require_curve(MODULES[self._kind_asked])
             return self._kind_asked
         for kind, module in MODULES.items():
             if self._says(module, "StatusGet"):
                 return kind
         return ""
+
+    def _require_curve(self, module: str) -> None:
+        # the blocking call waits for a day, also at a port that accepts the start and answers nothing
+        now_s = self._clock.monotonic_s()
+        if self._says(module, "StatusGet") or module not in self._opened:
+            self._shows_until_s = now_s + _SHOWS_S
+        elif now_s >= self._shows_until_s:
+            self.end()  # a curve whose answer was lost may have a file
+            problem = (
+                f"{module}.Start has no answer, and for {_SHOWS_S:g} s no curve has run: it never began, or is over"
+            )
+            raise ControllerSilent(problem, hint="another program may hold the port of blocking calls, or it is wedged")
 
     def _is_there(self) -> bool:
         if self._probe.arrived():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from queue import SimpleQueue
 from threading import Thread
@@ -33,8 +34,8 @@ _HINTS: Final = (
 
 
 _WEDGED: Final = (
-    "%s: this port may be wedged until Nanonis is restarted, as others report after a client was killed in mid-answer; "
-    "the next port is used in place of %d"
+    "%s: another program may hold this port, or it may be wedged until Nanonis is restarted, as others report after a "
+    "client was killed in mid-answer; the next port is used in place of %d"
 )
 _ALONE: Final = (
     "no port of Nanonis is left for a second connection: no spectrum can be taken, and the end of a scan is noticed by "
@@ -175,15 +176,21 @@ class Session:
         raise AssertionError("there is a port")
 
     def _reach_second(self, ports: Ports, working: Address) -> tuple[Address | None, Link | None]:
-        """Return the port for blocking calls and its connection; one that was silent must answer a question first."""
+        """Return the port for blocking calls and its connection, which has answered a question."""
         for address in ports.besides(working):
             link = self._connected(address, self._link.release)
             try:
-                if address in ports.silent:
+                with suppress(NanonisError):  # an error is an answer, too
                     link.ask("Scan.StatusGet")
             except ControllerLost as error:
-                self._log.warning("the port %d still stays silent: %s", address[1], error)
                 link.close()
+                if address in ports.silent:
+                    self._log.warning("the port %d still stays silent: %s", address[1], error)
+                elif isinstance(error, ControllerSilent):
+                    ports.silent.add(address)
+                    self._log.error(_WEDGED, error, address[1])
+                else:
+                    raise
                 continue
             ports.silent.discard(address)
             return address, link

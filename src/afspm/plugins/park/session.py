@@ -132,13 +132,14 @@ class Session:
         """
         link = self._open_link()
         try:
+            link.ask(IS_CONNECTED)  # a connection that answers nothing must not be waited for as a long script
             link.begin(expression)
             link.wait(wait_s)
         except BaseException:  # Ctrl-C, too: nothing else closes this connection
             link.close()
             raise
         # A value of None means that SmartScan has replied before the end of the script.
-        return LongCall(what, link, lambda value: value is None and self.script_runs())
+        return LongCall(what, link, lambda value: value is None and self.script_runs(), self.script_runs)
 
     def start(self, what: str, expression: str, refusal: int) -> LongCall:
         """Start a long script as `begin`. Raises Refused with the code `refusal`: it fails within `ANSWERS_S`."""
