@@ -180,9 +180,7 @@ class TranslatorProcess:
             state_dir=str(folder / "state"),
             retracts=retracts,
         )
-        # where the lock on the controller lies, which one that is killed leaves behind
-        own = {**os.environ, "TMPDIR": str(folder), "TEMP": str(folder)}
-        self._process = host(own)
+        self._process = host({**os.environ, "TMPDIR": str(folder), "TEMP": str(folder)})
         self._listening = Thread(target=(log or TranslatorLog()).listen, args=(self._process.stderr,))
         self._listening.start()
         stack.callback(self._end)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from afspm.basics.clock import Clock
 from afspm.basics.errors import AfspmError, ConfigError
+from afspm.translator.controller_lock import ControllerTaken
 from afspm.translator.driver_base import LOST, ControllerLost, ControllerSilent, DriverBase
 from afspm.translator.emulated_controller import EmulatedController
 from afspm.transport.process.failure import place_of
@@ -28,6 +29,7 @@ class Connection:
         controller: the emulator of this run, the only controller to connect to; None: the driver knows the
             address of its controller.
         on_lost: called to publish the loss.
+        take: called with the `identity` of the connected driver. Raises ControllerTaken.
 
     Attributes:
         is_reached: True while the driver is connected.
@@ -43,12 +45,13 @@ class Connection:
         clock: Clock,
         log: logging.Logger,
         on_lost: Callable[[], None],
+        take: Callable[[str], None] = lambda identity: None,
     ) -> None:
         self._driver = driver
         self._controller = controller
         self._clock = clock
         self._log = log
-        self._on_lost = on_lost
+        self._on_lost, self._take = on_lost, take
         self.stands = self.is_reached = False
         self.why_lost = self._logged = ""
         self.ever_stood = self._loss_published = False
@@ -80,6 +83,7 @@ class Connection:
             self._driver.connect()
         else:
             self._controller.reach(self._driver)
+        self._take(self._driver.identity)
         self.is_reached = True
 
     def reach_for_retract(self) -> None:
@@ -113,12 +117,12 @@ class Connection:
         """Call `do`. Return False after an error, which counts as a loss of the controller.
 
         Raises:
-            ConfigError: the first connection can't succeed with these settings.
+            ConfigError, ControllerTaken: the first connection can't succeed with these settings, or another run has it.
         """
         try:
             do()
             return True
-        except ConfigError as error:
+        except (ConfigError, ControllerTaken) as error:
             if not self.ever_stood:
                 raise
             self.lose(error)

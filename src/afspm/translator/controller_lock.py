@@ -6,16 +6,19 @@ import contextlib
 import errno
 import hashlib
 import os
+import socket
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, cast
 
 from afspm.basics.errors import AfspmError
 from afspm.basics.file_lock import lock
 
+# not Python's temporary folder, which each user and each shell may set
+_COMMON = (os.environ.get("PROGRAMDATA") or tempfile.gettempdir()) if sys.platform == "win32" else "/tmp"
 _LOCKED_BYTES = 1  # Windows lets no other process read locked bytes: the holder's name stands behind them
 
 
@@ -26,21 +29,70 @@ class ControllerTaken(AfspmError):
 
 
 @contextlib.contextmanager
-def commanding(address: str, run: str) -> Iterator[None]:
+def commanding(address: str, run: str) -> Iterator[Callable[[str], None]]:
     """Lock the controller against all other processes and users of this computer, within the `with` block.
+
+    Another computer is locked as a whole. On this one, where several emulated controllers may run, the ports are
+    locked, and the `identity` of the driver, since the controller may also listen on ports that `address` lacks.
 
     Args:
         address: address of the controller; empty: no lock is needed, since no other process can command the controller.
         run: the folder of this run, shown to refused runs.
 
+    Yields:
+        a function that locks the `identity`, once the driver is connected. Raises ControllerTaken.
+
     Raises:
         ControllerTaken: another process commands the controller, or the lock file can't be opened.
     """
-    if not address:
-        yield
-        return
-    path = _lock_file(address)
-    with _open_and_lock(path, address) as file:
+    is_here, names = _names(address)
+    held = set[str]()
+    with contextlib.ExitStack() as stack:
+
+        def take(name: str, where: str) -> None:
+            if name not in held:
+                stack.enter_context(_locked(name, where, run))
+                held.add(name)
+
+        def take_identity(identity: str) -> None:
+            if is_here and identity:
+                take(identity, f"{address}, {identity}")
+
+        for name in sorted(names):  # in one order: of two runs that begin together, one gets them all
+            take(name, address)
+        yield take_identity
+
+
+def _names(address: str) -> tuple[bool, set[str]]:
+    # whether the controller is on this computer, and the same names for all spellings of an address
+    plain = "".join(address.lower().split())
+    host, _, ports = plain.rpartition("://")[2].partition("/")[0].rpartition(":")
+    if not (host and ports.replace(",", "").isdigit()):  # such as shared memory
+        return True, {plain} if plain else set()
+    host = host.strip("[]")
+    try:
+        found = socket.getaddrinfo(host, 0, type=socket.SOCK_DGRAM)
+    except (OSError, UnicodeError):  # unknown now, and perhaps known later
+        return False, {host}
+    if any(_is_here(family, at) for family, _, _, _, at in found):
+        return True, {f"port {int(port)} of this computer" for port in ports.split(",") if port}
+    return False, {host, *(str(at[0]) for _, _, _, _, at in found)}
+
+
+def _is_here(family: int, at: tuple[object, ...]) -> bool:
+    # only an address of this computer can be bound
+    try:
+        with socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.bind(at)
+    except OSError:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def _locked(name: str, where: str, run: str) -> Iterator[None]:
+    path = _lock_folder() / hashlib.sha256(name.encode()).hexdigest()[:16]
+    with _open_and_lock(path, where) as file:
         # a full disk, or a file of another user: the holder's name is missing, but the lock is held all the same
         with contextlib.suppress(OSError):
             file.truncate(0)
@@ -53,7 +105,7 @@ def commanding(address: str, run: str) -> Iterator[None]:
                 path.unlink()
 
 
-def _open_and_lock(path: Path, address: str) -> BinaryIO:
+def _open_and_lock(path: Path, where: str) -> BinaryIO:
     while True:
         try:
             file = _open_lock_file(path)
@@ -75,7 +127,7 @@ def _open_and_lock(path: Path, address: str) -> BinaryIO:
             file.close()
             message = f"another run already commands this controller: {_holder(path)}"
             raise ControllerTaken(
-                message, where=address, hint="a controller takes commands from one run at a time: end that run first"
+                message, where=where, hint="a controller takes commands from one run at a time: end that run first"
             ) from error
         file.close()
 
@@ -94,21 +146,11 @@ def _open_lock_file(path: Path) -> BinaryIO:
     return cast("BinaryIO", os.fdopen(descriptor, mode))
 
 
-def _lock_file(address: str) -> Path:
-    # one file for all spellings of an address
-    plain = address.lower().replace("localhost", "127.0.0.1")
-    return _lock_folder() / hashlib.sha256(plain.encode()).hexdigest()[:16]
-
-
 def _lock_folder() -> Path:
     # common to all users: each may add files, and delete only their own (sticky bit). A link in its place is refused:
     # it may lead into a folder chosen by another user. The user who made the folder first, of several who measure here,
     # could rename the files of others: the lock prevents mistakes, and each local user can open the controller's port
-    in_common = {
-        "win32": os.environ.get("PROGRAMDATA"),
-        "darwin": "/tmp",
-    }  # where the temporary folder is each user's own
-    folder = Path(in_common.get(sys.platform) or tempfile.gettempdir()) / "afspm-controllers"
+    folder = Path(_COMMON) / "afspm-controllers"
     try:
         with contextlib.suppress(FileExistsError):
             folder.mkdir()

@@ -241,6 +241,8 @@ class DriverBase(ABC):
         controller_at: the address of the controller. The constructor sets it and `connect` reads it, since an
             experiment with an emulator puts the emulator's address there. Only one run at a time commands it. Empty:
             other processes can't reach the controller.
+        identity: words that distinguish the controller from others of this computer, such as its session's folder.
+            `connect` sets them, if one controller may have several addresses.
         prove: call it in `connect` once the connection is made, before the first question: it raises ControllerLost if
             an emulated controller does not belong to this run.
         groups: the parameters that the controller has in a form that a table can't describe.
@@ -320,6 +322,7 @@ class DriverBase(ABC):
     wake: Callable[[], None]
     for_a_while: Callable[[Mapping[str, Value], float], None]
     controller_at: str = ""
+    identity: str = ""
     lacking: Mapping[str, str] = MappingProxyType({})
     groups: Sequence[SettingsGroup] = ()
     memory: Plain

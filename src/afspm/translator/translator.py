@@ -72,6 +72,7 @@ class Translator:
         step: entered around everything that takes time, so that a busy process is not taken for a frozen process.
         controller: the emulator of this run, the only controller to connect to; None: the driver knows the
             address of its controller.
+        take: see `Connection`.
     """
 
     def __init__(
@@ -83,6 +84,7 @@ class Translator:
         log: logging.Logger,
         step: Callable[[], AbstractContextManager[None]] = nullcontext,
         controller: EmulatedController | None = None,
+        take: Callable[[str], None] = lambda identity: None,
     ) -> None:
         self.driver = driver
         self._port = port
@@ -102,7 +104,7 @@ class Translator:
             log.warning("the z feedback is off by intention: so says the person who has begun this run")
         # the sequence keeps its state: the microscope may still be scanning when it is reconnected
         undefined = partial(observer.publish, ScopeStatus(ScopeState.UNDEFINED))
-        self._connection = connection = Connection(driver, controller, clock, log, on_lost=undefined)
+        self._connection = connection = Connection(driver, controller, clock, log, undefined, take)
         self.requests = RequestHandler(
             driver,
             connection,
@@ -239,18 +241,18 @@ def run_translator(driver: DriverBase, context: ProcessContext, make: Callable[.
     """
     with contextlib.ExitStack() as stack:
         controller = wired_to(context.launch, driver)
-        # a real controller of this address is not touched, so not locked
-        address = "" if controller else driver.controller_at
+        # a real controller of this address is not touched, so not locked; a shadow commands nothing
+        address = "" if controller or driver.only_reads else driver.controller_at
         try:
-            stack.enter_context(commanding(address, context.launch.run_dir or ""))
+            take = stack.enter_context(commanding(address, context.launch.run_dir or ""))
+            if driver.common.trace:
+                _begin_trace(driver, context)
+                stack.callback(TRACE.end)
+            return _run_locked(driver, context, partial(make, controller=controller, take=take))
         except ControllerTaken as error:
             context.log.error("%s", error)
             # CRASHED, so that the supervisor retries a few times: the other run may be just ending
             return ExitCode.CRASHED
-        if driver.common.trace:
-            _begin_trace(driver, context)
-            stack.callback(TRACE.end)
-        return _run_locked(driver, context, partial(make, controller=controller))
 
 
 def _begin_trace(driver: DriverBase, context: ProcessContext) -> None:

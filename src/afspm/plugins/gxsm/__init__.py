@@ -186,6 +186,8 @@ class Gxsm(Driver):
         self.close()
         ask = self._asking = Asking(self._open_link())
         self.prove()
+        folder = ask.working_folder()  # the same by the bridge and by the shared memory
+        self.identity = "" if folder is None else f"GXSM in the folder {folder}"
         # the lists are the only proof that a name exists: neither `set`, `get` nor `action` reports an unknown name
         refnames, actions = ask.names("list_refnames"), ask.names("list_actions")
         missing = [ref for ref in REFNAMES if ref not in refnames]

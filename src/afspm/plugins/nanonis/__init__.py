@@ -250,7 +250,9 @@ class Nanonis(Driver):
         self._probe.look(self.log)
         if self._holds_current:
             self._preamplifier.look(self.log)
-        folder = self._session_dir or Path(session.ask("Util.SessionPathGet")[0])
+        reported = str(session.ask("Util.SessionPathGet")[0])
+        self.identity = f"session folder {reported} of Nanonis"
+        folder = self._session_dir or Path(reported)
         if not folder.is_dir():
             self.log.warning(
                 "the session folder %s does not exist on this computer: data is fetched over TCP (or set session_dir)",
