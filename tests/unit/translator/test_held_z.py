@@ -127,11 +127,11 @@ def test_moves_are_ramps_at_the_speed(held: Any) -> None:
     assert heights[-1] == pytest.approx(100e-12, abs=1e-15)
 
 
-@pytest.mark.parametrize("bound", ["1e-10", "5e-11"])
-def test_current_beyond_the_bound_ends_the_hold_with_the_reason(held: Any, bound: str) -> None:
+@pytest.mark.parametrize(("bound", "bias_v"), [("1e-10", 0.01), ("5e-11", 0.01), ("1e-10", -0.01)])
+def test_current_beyond_the_bound_ends_the_hold_with_the_reason(held: Any, bound: str, bias_v: float) -> None:
     assert put(held, names.HELD_Z_ABORT_CURRENT, bound).ok
     assert act(held, names.HOLD_Z).ok
-    assert put(held, names.TIP_BIAS_VOLTAGE, 0.01).ok
+    assert put(held, names.TIP_BIAS_VOLTAGE, bias_v).ok  # tip T9: a negative current is beyond the bound, too
     z_m = number(held, names.TIP_Z)
     put(held, names.HELD_Z_OFFSET, -300e-12)
     lowest_m = z_m

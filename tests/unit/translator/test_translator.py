@@ -7,6 +7,7 @@ import itertools
 import logging
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from afspm import wire
 from afspm.basics.errors import ConfigError, Refused, WireError
 from afspm.basics.exit_codes import ExitCode
 from afspm.client.cycle import Cycle, CycleOutcome
+from afspm.driver import action
 from afspm.model import (
     CLOCK_REQUEST,
     ControlRequest,
@@ -131,6 +133,20 @@ def test_the_tip_does_not_go_on_scanning_when_the_run_is_stopped(bench: Any, los
     assert bench.run_to_the_end(ParentGone()) == ExitCode.ORPHAN
     assert bench.microscope.done == (["scan"] if lost else ["scan", "stop"])
     assert bench.heard() == (["SCANNING", "UNDEFINED"] if lost else ["SCANNING", "INTERRUPTED", "FREE"])
+
+
+# tip T9
+def test_tip_does_not_go_on_with_a_curve_when_the_run_is_stopped(bench: Any, tmp_path: Path) -> None:
+    class WithCurves(type(bench.microscope)):  # type: ignore[misc]
+        @action(names.STOP_SPEC)
+        def stop_spec(self) -> None:
+            self.done.append("stop spec")
+            self.state = ScopeState.FREE
+
+    made = type(bench)(tmp_path, None, WithCurves)
+    assert made.ask(ACTION, names.START_SPEC).code == OK
+    assert made.run_to_the_end(ParentGone()) == ExitCode.ORPHAN
+    assert made.microscope.done == ["spec", "stop spec"]
 
 
 def switched(bench: Any, to: str) -> None:
