@@ -12,6 +12,7 @@ import pytest
 
 from afspm.basics.errors import ConfigError
 from afspm.client.component import Component
+from afspm.client.scope import Scope
 from afspm.components.planned_scans import ScanSeries
 from afspm.components.quiet_hours import QuietHours, is_act
 from afspm.model import (
@@ -302,6 +303,44 @@ def test_no_problem_is_solved_while_the_tip_is_withdrawn(tmp_path: Path) -> None
     moved = [one.subject for one in night.entries if one.time_ns * 1e-9 > START_S + 145.0 and one.response == 0]
     assert next(one for one in moved if one in ("x-engage", "start-scan")) == "x-engage"
     assert night.actions_of("repair") == ["start-scan"]
+    night.bench.close()
+
+
+# tip T9
+def test_tip_that_is_not_shown_and_was_moved_by_hand_is_never_engaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(Scope, "tip", None)
+    night = Night(tmp_path, withdraw=True, panel=[(280.0, "x-engage")])
+    night.go_to(2.2)
+    night.bench.set_mode(ControlMode.AUTOMATED)
+    night.go_to(2.4)
+    assert night.is_paused
+    assert night.actions_of("quiet_hours") == ["x-retract"]
+    assert "the microscope does not report its tip, which was moved by hand" in caplog.text
+    night.bench.close()
+
+
+# tip T9
+def test_pause_goes_on_after_a_kill_right_before_the_mode_is_set(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    set_mode, reached = QuietHours._set_mode, []
+
+    def killed_before(component: QuietHours, mode: ControlMode) -> str:
+        if not reached:
+            reached.append(component.memory["phase"])
+            component.scope.sleep(UNIT_S)  # it is killed meanwhile
+        return set_mode(component, mode)
+
+    monkeypatch.setattr(QuietHours, "_set_mode", killed_before)
+    night = Night(tmp_path)
+    night.bench.at(seconds(1.2), night.bench.kill, "quiet_hours")
+    night.go_to(1.5)
+    assert reached == ["pauses"]
+    assert night.is_paused
+    night.go_to(2.2)
+    assert night.is_at_work
     night.bench.close()
 
 

@@ -183,6 +183,13 @@ def test_parameters_set_by_an_action_are_judged() -> None:
     assert not refusal(with_action, action("x-high"), present(tip_bias_voltage=0.0, zctrl_setpoint=1e-11))
 
 
+# tip T9
+def test_difference_that_was_within_the_rounding_of_large_values_begins_when_they_are_small() -> None:
+    forbid = limits("tip-bias-voltage > x-sample-bias").forbid
+    low = ExperimentLimits(forbid=forbid, sets={"x-low": (Parameter(BIAS, "0.4"), Parameter("x-sample-bias", "0"))})
+    assert refusal(low, action("x-low"), present(tip_bias_voltage=1e9 + 0.5, x_sample_bias=1e9))
+
+
 def test_limits_with_rules_survive_json() -> None:
     assert from_plain(ExperimentLimits, json.loads(json.dumps(to_plain(limits())))) == limits()
 

@@ -425,9 +425,14 @@ def test_revocation_stops_the_scan_of_an_agent_without_control(agent: AgentLab) 
 
 
 @pytest.mark.parametrize(("lasts_s", "at_s"), [(60.0, 61.0), (900.0, 201.0)])
-def test_replaced_grant_shortens_a_scan_and_never_lengthens_it(agent: AgentLab, lasts_s: float, at_s: float) -> None:
+@pytest.mark.parametrize("releases", [False, True])
+def test_replaced_grant_shortens_a_scan_and_never_lengthens_it(
+    agent: AgentLab, lasts_s: float, at_s: float, releases: bool
+) -> None:
     agent.begin(agent.grant(lasts_s=200.0))
     scanning(agent)
+    if releases:  # tip T9: no loss of control stops the scan then
+        agent.lab.says(AGENT, ControlRequest.RELEASE_CTRL)
     assert agent.give(agent.grant(lasts_s=lasts_s)) is OK
     passes(agent, at_s - 2.0)
     assert not stopped(agent)

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from tests.unit.scheduler.logic_lab import Lab, in_control, killed, replies
 
 from afspm.model import (
+    RELAY_REQUEST,
     ActByHand,
     ControlMode,
     ControlRequest,
     ControlResponse,
     Feedback,
+    InstrumentReading,
+    InstrumentReadings,
     PanelAct,
     Parameter,
+    RelayedMessage,
     Response,
     ResponseDetail,
     ScopeState,
@@ -23,6 +28,7 @@ from afspm.model import (
     names,
 )
 from afspm.scheduler.control.arbitration import RoleTable, Rules
+from afspm.scheduler.instruments.conditions import InstrumentSettings
 from afspm.scheduler.safety.limit_checker import LimitChecker
 from afspm.scheduler.safety.limits import ExperimentLimits, ForbiddenState, Limit
 from afspm.scheduler.safety.movers import Mover, MoverSettings, MoverState
@@ -46,8 +52,8 @@ SETTINGS = SchedulerSettings(limits=LIMITS, rules=Rules(RoleTable(approve=("page
 class Motor:
     """A scheduler with a microscope whose tip and current read as given."""
 
-    def __init__(self) -> None:
-        self.lab: Lab = in_control(SETTINGS)
+    def __init__(self, settings: SchedulerSettings = SETTINGS) -> None:
+        self.lab: Lab = in_control(settings)
         self.tip: dict[str, Any] = {"x_engaged": "true"}
         self.lab.answer_reads(**self.tip)
         self.lab.scope_is(ScopeState.FREE)
@@ -391,3 +397,31 @@ def test_tip_that_reads_at_the_sample_needs_an_approach_after_a_move(motor: Moto
     motor.lab.mode("page", ControlMode.AUTOMATED)
     motor.lab.take_control("experiment")
     assert motor.refusal(names.START_SCAN).again_ns is not None
+
+
+# tip T9
+def test_stage_that_others_move_asks_for_an_approach() -> None:
+    motor = Motor(replace(SETTINGS, instruments=InstrumentSettings(("lab",))))
+    for target in (1.0, 1.0, 3.0):
+        reading = InstrumentReading(STAGE, target, "mm", 0.1, target)
+        report = motor.lab.codec.encode(InstrumentReadings(motor.lab.now_ns, "lab", (reading,)))
+        motor.lab.ask("lab", RELAY_REQUEST, RelayedMessage("InstrumentReadings", report))
+    assert "has moved since the last approach: approach (x-approach)" in motor.refusal(names.START_SCAN).reason
+
+
+# tip T9
+def test_repeated_step_away_counts_for_the_way_once_and_never_for_the_distance() -> None:
+    state = MoverState().sent(LIMITS.movers, AWAY, 20.0, "a", is_repeated=False)
+    state = state.withdrawn()  # the steps before it no longer count
+    state = state.sent(LIMITS.movers, AWAY, 20.0, "a", is_repeated=True).done("a").free()  # answered from memory
+    assert (state.retracted, state.ways[AWAY]) == (0, 20.0)
+    assert "0 of 40 steps" in state.refusal(LIMITS.movers, RIGHT, 10.0)
+
+
+# tip T9
+def test_refused_move_leaves_the_approach_that_an_earlier_move_needs(motor: Motor) -> None:
+    motor.withdraws()
+    motor.does(AWAY)
+    motor.does(AWAY, ControlResponse.ACTION_ERROR)
+    motor.tip = {"x_engaged": "true"}
+    assert "has moved since the last approach: approach (x-approach)" in motor.refusal(names.START_SCAN).reason

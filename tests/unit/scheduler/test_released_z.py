@@ -67,6 +67,19 @@ def test_z_of_a_dead_holder_is_released_and_the_tip_stays(held: Lab) -> None:
     assert sent(held) == [names.RELEASE_Z], "the feedback is on: nothing is retracted"
 
 
+# tip T9
+def test_hold_that_is_not_answered_when_its_holder_dies_is_released() -> None:
+    lab = in_control(SchedulerSettings())
+    lab.scope_is(ScopeState.FREE)
+    lab.publish("ZCtrlParameters", ON)
+    lab.ask("experiment", ACTION, names.HOLD_Z)
+    hold = lab.forwarded[-1]
+    dies(lab)
+    lab.publish("ZCtrlParameters", OFF)
+    lab.answer(hold)
+    assert sent(lab) == [names.HOLD_Z, names.RELEASE_Z]
+
+
 @pytest.mark.parametrize("how", ["problem", "manual", "released"])
 def test_z_is_released_however_control_is_lost(held: Lab, how: str) -> None:
     if how == "problem":
