@@ -40,7 +40,8 @@ SAMPLE_KINDS = ("an adatom appears", "a particle is dragged")
 CONTRAST_KINDS = ("overshoot", "saturation", "bent contrast", "z scale")
 TIP_KINDS = ("blunt tip", "double tip", "debris on the tip")
 NOISE_KINDS = ("streaks", "noise burst")
-KINDS = (*ROOM_KINDS, *SAMPLE_KINDS, *CONTRAST_KINDS, *TIP_KINDS, *NOISE_KINDS)
+EVAPORATED_KINDS = ("several adatoms appear",)
+KINDS = (*ROOM_KINDS, *SAMPLE_KINDS, *CONTRAST_KINDS, *TIP_KINDS, *NOISE_KINDS, *EVAPORATED_KINDS)
 
 
 def grains(place: Random, sample: Random, x: Array, y: Array) -> Array:
@@ -168,10 +169,10 @@ class Room:
             creep_px = random.uniform(2.0, 6.0) * np.array([math.cos(turn), math.sin(turn)])
             length = random.uniform(4.0, 20.0)
         clean = self._clean(LEARNT, drift_px, self._image(self._tip), creep_px, length)
-        if kind in (*SAMPLE_KINDS, *TIP_KINDS):
+        if kind in (*SAMPLE_KINDS, *TIP_KINDS, *EVAPORATED_KINDS):
             image_before, image_after = self._changed(kind, row)
             after = self._clean(LEARNT, drift_px, image_after, creep_px, length)
-            if kind in SAMPLE_KINDS:  # a dragged particle is at its first place until the tip meets it
+            if kind not in TIP_KINDS:  # a dragged particle is at its first place until the tip meets it
                 whole = self._clean(LEARNT, drift_px, image_before, creep_px, length)
                 clean = [np.where(np.arange(PIXELS)[:, None] < row, a, b) for a, b in zip(whole, after, strict=True)]
             else:
@@ -220,16 +221,19 @@ class Room:
             return before, np.asarray(ndimage.uniform_filter1d(before, int(long * FINE), axis=1))
         at = np.array([random.uniform(-50.0, 50.0), row - PIXELS / 2 + random.uniform(2.0, 12.0)])
         radius, height = random.uniform(2.0, 6.0), random.uniform(0.8, 2.5)
-        with_one = self._bulge(at, radius, height)
+        if kind in EVAPORATED_KINDS:
+            more = [random.uniform((-60.0, row - 60.0), (60.0, 60.0)) for _ in range(random.integers(2, 6))]
+            return before, self._bulge([at, *more], radius, height)
+        with_one = self._bulge([at], radius, height)
         if kind == "an adatom appears":
             return before, with_one
         turn, by = random.uniform(0.0, math.pi), random.uniform(4.0, 15.0)
-        return with_one, self._bulge(at + by * np.array([math.cos(turn), math.sin(turn)]), radius, height)
+        return with_one, self._bulge([at + by * np.array([math.cos(turn), math.sin(turn)])], radius, height)
 
-    def _bulge(self, at: Array, radius: float, height: float) -> Array:
+    def _bulge(self, places: Sequence[Array], radius: float, height: float) -> Array:
         x, y = np.meshgrid(self._axis, self._axis)
-        cap = height * np.maximum(0.0, 1.0 - ((x - at[0]) ** 2 + (y - at[1]) ** 2) / radius**2)
-        return _imaged(self._ground + cap, self._tip)
+        caps = [1.0 - ((x - at[0]) ** 2 + (y - at[1]) ** 2) / radius**2 for at in places]
+        return _imaged(self._ground + height * np.maximum(0.0, caps).max(axis=0), self._tip)
 
     def _image(self, tip: _RoomTip) -> Array:
         if tip not in self._images:

@@ -166,6 +166,19 @@ def test_adsorbate_is_looked_at_and_never_stopped_for() -> None:
     assert levels == [AlarmLevel.LOOK]
 
 
+# tip T4
+@pytest.mark.parametrize("number", [3, 5])
+def test_several_new_adsorbates_are_looked_at_and_never_stopped_for(number: int) -> None:
+    running = taught().begin(HOME, KIND, LEARNT * PERIOD_S, channels=2)
+    assert running is not None
+    picture = heights(night()[LEARNT])
+    for at in [(20, 12), (24, 50), (29, 31), (35, 20), (41, 44)][:number]:
+        picture = adorned(picture, at)
+    lines = ([values[row] for values in picture] for row in range(ROWS))
+    levels = [alarm.level for row, line in enumerate(lines) if (alarm := running.add(row, line)) is not None]
+    assert levels == [AlarmLevel.LOOK]
+
+
 def test_zero_rows_are_missing_rows() -> None:
     picture = heights(night()[LEARNT])
     for values in picture:

@@ -13,8 +13,9 @@ scans, times a factor, and at least a fixed value. A sum above the threshold rai
 threshold `LOOK`, once enough lines since the change are known. Before an alarm, a wider search for the shift shows
 whether the sample has jumped: then the template explains the lines again. A scan is stopped only for a change of the
 whole line, or for one that lasts, as a tip makes it: an adsorbate, or a particle that was dragged, changes one or two
-narrow parts of some lines. Nor is it stopped if another contrast, the end of the range of heights, or overshoot at the
-edges explains the lines (`causes`). Strong noise and streaks are looked at (`disturbances`).
+narrow parts of some lines, and several adsorbates few cells of rows and columns. Nor is it stopped if another contrast,
+the end of the range of heights, or overshoot at the edges explains the lines (`causes`). Strong noise and streaks are
+looked at (`disturbances`).
 
 Without retrace, the waves of a hum may be in step in successive lines, as an image is. But a hum has one frequency, and
 a changed tip many. So before an alarm, a narrow peak in the spectrum of the differing lines is removed from these and
@@ -98,6 +99,10 @@ class JudgeSettings:
     # share of the threshold that the rest of the lines must reach before a scan is stopped. New adatoms and dragged
     # particles reached 0.06, two tips that change at few steps and scratches 0.3.
     elsewhere: float = 0.25
+    # rows of a cell, its width relative to the line, and the share of the cells that new adatoms may fill
+    cell: tuple[int, float, float] = (4, 1 / 16, 1 / 3)
+    alike: float = 0.5  # correlation of the differences with the steepness of the sample, above which a tip made them
+    alike_px: int = 16  # farthest shift of a ghost for that
     unexplained: float = 0.4  # share of the threshold that another cause than the tip may leave
     # share of the sum that another cause may leave, if that is more than `unexplained`; each of 9 changed tips left a
     # third or more
@@ -516,7 +521,12 @@ class ScanJudge:
 
     def _level(self) -> AlarmLevel | None:
         suspects = sum(self._is_suspect(row) for row, _ in self._recent)
-        if self.evidence >= 1.0 and suspects >= FITTED.fewest_stop and (self._is_everywhere() or self._lasts()):
+        if (
+            self.evidence >= 1.0
+            and suspects >= FITTED.fewest_stop
+            and (self._is_everywhere() or self._lasts())
+            and (not self._is_in_spots() or self._is_alike())
+        ):
             return AlarmLevel.STOP
         return AlarmLevel.LOOK if self.evidence >= FITTED.look and suspects >= FITTED.fewest_suspect else None
 
@@ -526,6 +536,22 @@ class ScanJudge:
         products = [self._filter.products(fits) for row, _ in suspects if (fits := self.fitted.get(row))]
         total = np.sum([np.nan_to_num(one) for one in products], axis=0)
         return all(self._differ(suspects, _elsewhere(total, *parts)) for parts in FITTED.parts)
+
+    def _is_in_spots(self) -> bool:
+        # whether the lines differ in few cells of rows and columns alone, as several new adatoms do
+        lines = [(row, line) for row, line in self._recent if self._is_suspect(row) and self.fitted.get(row)]
+        products = np.array([np.nan_to_num(self._filter.products(self.fitted[row])) for row, _ in lines])
+        return not self._differ(lines, _outside_of_spots(products, *FITTED.cell))
+
+    def _is_alike(self) -> bool:
+        # whether the lines since the change differ where the sample is steep: a sample with few features has few edges
+        # that a tip widens, and few ghosts of them, which fill no more cells than adatoms
+        rows = list(self.fitted)
+        since = rows.index(self._cusum.since) if self._cusum.since in rows else 0
+        lines = [fits for row in rows[since:] if (fits := self.fitted[row])]
+        differ = np.nan_to_num([np.mean([fit.residual for fit in fits], axis=0) for fits in lines])
+        steep = np.array([fits[0].steepness for fits in lines])
+        return _highest_correlation(np.abs(differ), steep, FITTED.alike_px) >= FITTED.alike
 
     def _lasts(self) -> bool:
         rows = round(FITTED.lasting * len(self._comparer.place.templates[0].heights))
@@ -564,8 +590,8 @@ class ScanJudge:
         # new adatom were stopped)
         again = replace(self._comparer, before=None)
         cusum, highest = Cusum(), 0.0
-        for row, line in lines:
-            if fits := again.fits(row, [np.where(where, values, np.nan) for values in line]):
+        for (row, line), there in zip(lines, np.broadcast_to(where, (len(lines), where.shape[-1])), strict=True):
+            if fits := again.fits(row, [np.where(there, values, np.nan) for values in line]):
                 cusum.add(row, self._sigmas(fits))
                 highest = max(highest, cusum.value)
         return highest >= FITTED.elsewhere * self.threshold
@@ -649,6 +675,26 @@ def _elsewhere(total: Array, parts: int, width: float) -> NDArray[np.bool_]:
         first = int(inside.argmax())
         elsewhere[first : first + wide] = False
     return elsewhere
+
+
+def _outside_of_spots(products: Array, rows: int, width: float, most: float) -> NDArray[np.bool_]:
+    # the pixels of each line outside of the cells with the largest sums
+    (count, pixels), columns = products.shape, max(1, round(width * products.shape[1]))
+    padded = np.pad(products, ((0, -count % rows), (0, -pixels % columns)))
+    cells = padded.reshape(padded.shape[0] // rows, rows, -1, columns).sum(axis=(1, 3))
+    outside = cells <= np.quantile(cells, 1.0 - most)
+    return np.asarray(outside.repeat(rows, axis=0).repeat(columns, axis=1)[:count, :pixels])
+
+
+def _highest_correlation(first: Array, second: Array, reach_px: int) -> float:
+    # of two pictures, over all shifts within the reach
+    first, second = first - np.median(first), second - np.median(second)
+    padded = (2 * first.shape[0], 2 * first.shape[1])  # else one end would be shifted onto the other
+    product = np.fft.irfft2(np.fft.rfft2(first, padded) * np.conj(np.fft.rfft2(second, padded)), padded)
+    for axis, size in enumerate(first.shape):
+        reach = min(reach_px, size - 1)
+        product = np.take(product, range(-reach, reach + 1), axis=axis, mode="wrap")
+    return float(product.max() / max(np.linalg.norm(first) * np.linalg.norm(second), 1e-30))
 
 
 def _narrowest(lines: Array) -> tuple[float, float]:
