@@ -28,7 +28,8 @@ class TipClassifier(Component):
         channel: channel of the heights, by role or name.
         retrace_channel: channel of their retrace; empty if not recorded (then debris is not detected).
         reference_scans: number of scans of each kind for the reference.
-        flag_after: bad scans in a row until the problem is flagged.
+        flag_after: bad scans in a row until the problem is flagged. A single one may show a slower feedback, or a jump
+            of the sample.
         clear_after: good scans in a row until it is cleared.
         detail: share of the fine detail at a known place below which the tip is blunt.
         ghost: correlation of a ghost image at a known place above which the tip is double.
@@ -48,7 +49,7 @@ class TipClassifier(Component):
         channel: Annotated[ChannelName, HEIGHT] = HEIGHT,
         retrace_channel: Annotated[ChannelName, HEIGHT] = HEIGHT_RETRACE,
         reference_scans: int = 4,
-        flag_after: int = 1,
+        flag_after: int = 2,
         clear_after: int = 1,
         detail: float = TipTolerance.detail,
         ghost: float = TipTolerance.ghost,

@@ -50,14 +50,15 @@ def verdicts_of(lab: Lab) -> list[tuple[int, float]]:
     return [verdict for verdict in found if verdict is not None]
 
 
-def test_a_changed_tip_is_flagged_once_and_a_good_one_clears_it() -> None:
+def test_a_changed_tip_is_flagged_once_by_the_second_scan_and_a_good_one_clears_it() -> None:
     lab = Lab("tip_classifier")
     night(lab)
-    lab.at(450.0, lambda: flagged.append(lab.control.published().problems))
+    for at_s in (450.0, 550.0):
+        lab.at(at_s, lambda: flagged.append(lab.control.published().problems))
     lab.at(700.0, lab.kill)
     flagged: list[tuple[int, ...]] = []
     assert run(classifier(), lab) == ExitCode.ENDED
-    assert flagged == [(TIP,)]
+    assert flagged == [(), (TIP,)], "one bad scan may show a slower feedback (tip T2)"
     assert lab.control.published().problems == ()
     assert asked(lab, ControlRequest.ADD_EXP_PRBLM) == 1
     assert asked(lab, ControlRequest.RMV_EXP_PRBLM) == 1
@@ -71,14 +72,14 @@ def test_verdict_is_published_with_the_time_of_its_scan() -> None:
     assert verdicts_of(lab) == [(story[3][0].time_ns, BAD), (story[4][0].time_ns, BAD), (story[5][0].time_ns, GOOD)]
 
 
-def test_single_bad_scan_is_not_flagged_if_two_are_required() -> None:
+def test_single_bad_scan_is_flagged_if_one_is_enough() -> None:
     lab = Lab("tip_classifier")
     pairs = channels(1, "double", 5)
     for number, pair in enumerate((*pairs[:3], pairs[5])):
         publish_at(lab, 100.0 * (number + 1), pair)
     lab.at(500.0, lab.kill)
-    run(classifier(flag_after=2), lab)
-    assert asked(lab, ControlRequest.ADD_EXP_PRBLM) == 0
+    run(classifier(flag_after=1), lab)
+    assert asked(lab, ControlRequest.ADD_EXP_PRBLM) == 1
 
 
 def test_reference_and_counts_survive_a_kill(tmp_path: Path) -> None:
@@ -90,7 +91,8 @@ def test_reference_and_counts_survive_a_kill(tmp_path: Path) -> None:
     assert run(classifier(), lab, tmp_path) == ExitCode.ORPHAN
     lab.restart_component()  # the last scan is sent again, and must not be learnt from twice
     publish_at(lab, 100.0, pairs[5])
-    lab.at(200.0, lab.kill)
+    publish_at(lab, 200.0, pairs[6])
+    lab.at(300.0, lab.kill)
     again = classifier()
     run(again, lab, tmp_path)
     (kind,) = again.judge.kinds
@@ -111,12 +113,12 @@ def test_nothing_is_learnt_while_a_problem_is_flagged() -> None:
 def test_treated_tip_is_flagged_by_later_bad_scans_only() -> None:
     lab = Lab("tip_classifier")
     pairs = channels(1, "double", 5)
-    for number, pair in enumerate((*pairs[:3], pairs[5])):
+    for number, pair in enumerate((*pairs[:3], *pairs[5:7])):
         publish_at(lab, 100.0 * (number + 1), pair)
-    lab.at(500.0, lambda: lab.clear(TIP))
+    lab.at(550.0, lambda: lab.clear(TIP))
     elsewhere = Region((0.0, 0.0), (5e-6, 5e-6))  # an overview, without a reference
     for scan in pairs[3]:
-        overview = Scan(elsewhere, scan.channel, scan.unit, scan.values, (pairs[5][0].time_ns or 0) + 10**9)
+        overview = Scan(elsewhere, scan.channel, scan.unit, scan.values, (pairs[6][0].time_ns or 0) + 10**9)
         lab.at(600.0, partial(lab.publish, overview))
     lab.at(800.0, lab.kill)
     run(classifier(), lab)
