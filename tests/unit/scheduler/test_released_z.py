@@ -109,6 +109,13 @@ def test_scan_is_stopped_before_z_is_released(held: Lab) -> None:
     assert sent(held)[3:] == []
 
 
+# tip T9
+def test_scan_in_a_hold_is_stopped_before_its_release_also_if_its_holder_gives_control_back(held: Lab) -> None:
+    held.scope_is(ScopeState.SCANNING)
+    held.says("experiment", ControlRequest.RELEASE_CTRL, 0)
+    assert sent(held) == [names.STOP_SCAN]
+
+
 def test_tip_is_retracted_if_the_feedback_is_not_on_in_time(held: Lab) -> None:
     dies(held)
     held.answer(held.forwarded[-1])
