@@ -184,6 +184,13 @@ def test_parameters_set_by_an_action_are_judged() -> None:
 
 
 # tip T9
+def test_both_values_that_an_action_gives_one_parameter_are_judged() -> None:
+    ends = Parameter(BIAS, "3", "V"), Parameter(BIAS, "0.5", "V")
+    swept = ExperimentLimits(forbid=limits().forbid, sets={"x-sweep": ends})
+    assert refusal(swept, action("x-sweep"), present(tip_bias_voltage=0.0, zctrl_setpoint=1e-9))
+
+
+# tip T9
 def test_difference_that_was_within_the_rounding_of_large_values_begins_when_they_are_small() -> None:
     forbid = limits("tip-bias-voltage > x-sample-bias").forbid
     low = ExperimentLimits(forbid=forbid, sets={"x-low": (Parameter(BIAS, "0.4"), Parameter("x-sample-bias", "0"))})
