@@ -52,12 +52,15 @@ def send_frames(socket: Socket, frames: Sequence[bytes]) -> bool:
     return True
 
 
-def send_packet(socket: Socket, packet: Packet, stamp: bytes | None, *, topic: bytes | None = None) -> None:
+def send_packet(
+    socket: Socket, packet: Packet, stamp: bytes | None, *, topic: bytes | None = None, track: bool = False
+) -> zmq.MessageTracker | None:
     """Publish a packet; a received payload is sent from its own buffer. Never blocks.
 
     Args:
         stamp: the third frame, a serialised time; None: the packet has two frames.
         topic: frame before the envelope, for a replay to one subscriber; None: no such frame.
+        track: whether to return a tracker, which is done once the packet has left the queues of all subscribers.
 
     Raises:
         zmq.Again: the queue of a subscriber is full, and the socket may not drop packets (XPUB_NODROP).
@@ -69,10 +72,14 @@ def send_packet(socket: Socket, packet: Packet, stamp: bytes | None, *, topic: b
         payload = origin if isinstance(origin, zmq.Frame) and len(origin) == payload.nbytes else payload.tobytes()
     if topic is not None:
         socket.send(topic, _NOW | _MORE)
-    socket.send(packet.envelope.encode(), _NOW | _MORE)
+    envelope: bytes | zmq.Frame = packet.envelope.encode()
+    if track:
+        envelope = zmq.Frame(envelope, track=True, copy=False)  # libzmq has no owner to release of a copied frame
+    socket.send(envelope, _NOW | _MORE, copy=not track)
     socket.send(payload, _NOW if stamp is None else _NOW | _MORE, copy=False)  # libzmq copies small frames all the same
     if stamp is not None:
         socket.send(stamp, _NOW)
+    return envelope.tracker if isinstance(envelope, zmq.Frame) else None
 
 
 def descriptor_of(frame: zmq.Frame) -> int:

@@ -30,6 +30,7 @@ _BATCH, _MOST_REPLAYS = 100, 5
 _BEACON_S = 1.0
 _SETTLED_S = 0.05  # a SUB socket sends its prefixes one by one
 _TOGETHER_S = 1.0  # from one shared replay to the next: subscribers that join in between share it
+_MARK_EACH = QUEUE_LENGTH // 40  # packets of a shared replay
 _PAUSE_S = 0.05  # libzmq needs less to send half a queue on this computer
 _STUCK_S = 10.0  # twice the time after which a peer that reads nothing is disconnected
 
@@ -167,7 +168,7 @@ class _SharedReplay:
     A plain SUB socket accepts a packet only under its envelope, and libzmq sends it to each subscriber of this
     envelope. So a replay of `n` packets to each of `m` sockets would send `n m²` packets, and fill the queues of all
     subscribers until newer packets are dropped. Instead, sockets that join together share a replay, and it pauses while
-    the queue of any subscriber is more than half full.
+    its packets fill half of the queue of any subscriber.
 
     Attributes:
         due_s: real monotonic time of the next call of `go_on`; infinity without a replay.
@@ -180,6 +181,8 @@ class _SharedReplay:
         self._prefixes: tuple[str, ...] = ()  # of the replay under way
         self._left: deque[Packet] = deque()
         self._next_s = self._give_up_s = -math.inf
+        self._sent = 0
+        self._marks: deque[zmq.MessageTracker] = deque()  # of each _MARK_EACH-th packet, in order
 
     def join(self, prefix: str) -> None:
         """Let the next replay include the packets under `prefix`."""
@@ -219,21 +222,29 @@ class _SharedReplay:
         return True
 
     def _send(self) -> None:
-        # With XPUB_NODROP a send fails while the queue of any receiver has reached SNDHWM; the queues of existing
-        # connections take a new value at once. A queue that is full already drops the packet, as it does any other.
-        socket = self._socket
-        socket.setsockopt(zmq.SNDHWM, QUEUE_LENGTH // 2)
-        socket.setsockopt(zmq.XPUB_NODROP, 1)
+        # SNDHWM stays as it is: libzmq 4.3.5 jumps into freed memory if it is changed while subscribers come and go.
+        # With XPUB_NODROP a send fails while the queue of any receiver is full. A queue that was found full by a live
+        # packet drops this packet as it does any other.
+        self._socket.setsockopt(zmq.XPUB_NODROP, 1)
         try:
-            while self._left:
+            while self._left and self._has_room():
                 packet = self._left[0]
-                send_packet(socket, packet, None if packet.time_ns is None else wire.encode_time(packet.time_ns))
+                stamp = None if packet.time_ns is None else wire.encode_time(packet.time_ns)
+                tracker = send_packet(self._socket, packet, stamp, track=self._sent % _MARK_EACH == 0)
+                if tracker is not None:
+                    self._marks.append(tracker)
+                self._sent += 1
                 self._left.popleft()
         except zmq.Again:
             pass
         finally:
-            socket.setsockopt(zmq.XPUB_NODROP, 0)
-            socket.setsockopt(zmq.SNDHWM, QUEUE_LENGTH)
+            self._socket.setsockopt(zmq.XPUB_NODROP, 0)
+
+    def _has_room(self) -> bool:
+        # libzmq frees a packet, and so its mark, once it has left the last queue: queues keep the order
+        while self._marks and self._marks[0].done:
+            self._marks.popleft()
+        return len(self._marks) * _MARK_EACH < QUEUE_LENGTH // 2
 
     def _give_up(self) -> None:
         self._log.warning(
@@ -242,3 +253,4 @@ class _SharedReplay:
             "start them again when the link is faster"
         )
         self._left.clear()
+        self._marks.clear()  # a subscriber that reads nothing must not hold up the next replay, too

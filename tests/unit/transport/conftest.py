@@ -8,7 +8,25 @@ from contextlib import ExitStack
 from typing import Any
 
 import pytest
+import zmq
 from deadlines import DEADLINE_S
+
+
+@pytest.fixture(autouse=True)
+def constant_queues(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Fail a test in which the queue length of a bound or connected socket is changed: libzmq may crash then."""
+    # faults A1
+    changed: list[str] = []
+    set_option = zmq.Socket.set
+
+    def checked(socket: Any, option: int, value: Any) -> None:
+        if option in (zmq.SNDHWM, zmq.RCVHWM) and (address := socket.getsockopt(zmq.LAST_ENDPOINT).rstrip(b"\0")):
+            changed.append(f"{zmq.SocketOption(option).name} at {address!r}")
+        set_option(socket, option, value)
+
+    monkeypatch.setattr(zmq.Socket, "setsockopt", checked)
+    yield
+    assert not changed
 
 
 @pytest.fixture
