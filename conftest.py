@@ -7,6 +7,7 @@ import gc
 import os
 import shutil
 import signal
+import subprocess
 import tempfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -15,6 +16,7 @@ from typing import Any
 
 import pytest
 import zmq
+from benchmarks.crashes import CrashWatch
 from deadlines import DEADLINE_S
 from hypothesis import HealthCheck, settings
 
@@ -96,6 +98,28 @@ def polls_of_benches(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyP
     """Let the benches of one test in thirty poll the microscope at all times, and check the polls that others skip."""
     if zlib.crc32(request.node.nodeid.encode()) % 30 == 0:
         monkeypatch.setenv("AFSPM_BENCH_POLLS", "checked")
+
+
+@pytest.fixture(autouse=True)
+def crashes(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Fail a test in which a process of the test, or of a run in its folder, crashes: a supervisor would hide it."""
+    watch = CrashWatch()
+    _started.clear()
+    yield
+    found = [crash for process in _started for crash in watch.of(process)]
+    if (folder := request.node.funcargs.get("tmp_path")) is not None:
+        found += watch.in_logs(folder)
+    assert not found or request.node.get_closest_marker("crashes"), found
+
+
+class _WatchedPopen(subprocess.Popen[Any]):
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        _started.append(self)
+
+
+_started: list[subprocess.Popen[Any]] = []
+subprocess.Popen = _WatchedPopen  # type: ignore[misc]
 
 
 @pytest.fixture

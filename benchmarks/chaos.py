@@ -29,6 +29,7 @@ from pathlib import Path
 
 from afspm.basics.clock import ExperimentClock
 from afspm.storage.memory import Memory
+from benchmarks.crashes import CrashWatch
 
 SAMPLE = Path(__file__).parents[1] / "experiments" / "tip_repair" / "experiment.toml"
 OVER = """
@@ -125,6 +126,7 @@ class Night:
 
     def run(self) -> list[str]:
         """Run the night and return the faults found."""
+        crashes = CrashWatch()
         over = self.folder / "over.toml"
         over.write_text(OVER.format(speed=SPEED, minutes=MINUTES), encoding="utf-8")
         command = (sys.executable, "-m", "afspm", "run", str(SAMPLE), str(over), "--verbose")
@@ -143,7 +145,7 @@ class Night:
             return [f"it did not end within {DEADLINE_S:g} s"]
         wrong = [] if code == 0 else [f"exit code {code}"]
         name = (self.folder / "runs" / "latest").resolve().name
-        return wrong + list(found_wrong(self.folder / "runs" / name))
+        return [*wrong, *found_wrong(self.folder / "runs" / name), *crashes.in_logs(self.folder)]
 
     def _read(self, process: subprocess.Popen[bytes]) -> None:
         assert process.stdout is not None

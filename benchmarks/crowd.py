@@ -1,9 +1,10 @@
 """`python -m benchmarks.crowd [--scans N] [--subscribers M]`: plain subscribers that join and leave in crowds.
 
 A run with `[security] insecure = true`, as published clients need it: scans of 256² at 300 times real time, the page
-with viewers, and a component that logs much. In each half minute the plain SUB sockets join, a quarter of them read
-nothing, and leave again. The run must end by itself, every scan that was measured must be known to the series and
-recorded, and the scheduler's memory stays bounded. Counted, never timed: a loaded computer takes longer.
+with viewers, and a component that logs much. In each half minute the plain SUB sockets of two crowds join, a quarter of
+them read nothing, and leave again. The run must end by itself, no process may crash, every scan that was measured must
+be known to the series and recorded, and the scheduler's memory stays bounded. Counted, never timed: a loaded computer
+takes longer.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import zmq
 
 import afspm
 from afspm.storage.memory import Memory
+from benchmarks.crashes import CrashWatch
 from benchmarks.processes import PORTS
 
 EXPERIMENT = """
@@ -77,7 +79,7 @@ class Chatterbox(Component):
             self.log.info("line %d", number)
 """
 VIEWERS = 20
-STAYS_S = HALF_ROUND_S = 15.0
+CROWDS = 2
 STALLED_S = 180.0
 """Real time without a new scan after which the run counts as standing still: 60 times a scan on a loaded computer."""
 MOST_MB = 180.0
@@ -88,16 +90,16 @@ QUEUE_OF_DEAF = 10
 class Crowd(threading.Thread):
     """Plain SUB sockets that all join, stay, and leave, again and again."""
 
-    def __init__(self, address: str, count: int) -> None:
+    def __init__(self, address: str, count: int, half_round_s: float) -> None:
         super().__init__(daemon=True)
-        self._address, self._count = address, count
+        self._address, self._count, self._half_round_s = address, count, half_round_s
         self._over = threading.Event()
         self.rounds = self.received = self.distinct = self.most = 0
 
     def run(self) -> None:
         while not self._over.is_set():
             self._round()
-            self._over.wait(HALF_ROUND_S)
+            self._over.wait(self._half_round_s)
 
     def _round(self) -> None:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -113,7 +115,7 @@ class Crowd(threading.Thread):
             if not is_deaf:
                 poller.register(socket, zmq.POLLIN)
                 received[socket] = 0
-        until_s = time.monotonic() + STAYS_S
+        until_s = time.monotonic() + self._half_round_s
         while time.monotonic() < until_s and not self._over.is_set():
             for ready, _ in poller.poll(200):
                 with contextlib.suppress(zmq.Again):
@@ -147,8 +149,9 @@ def _viewers(url: str) -> Iterator[None]:
 class Attacked:
     """One run under attack."""
 
-    def __init__(self, folder: Path, scans: int, subscribers: int) -> None:
-        self._folder, self._scans, self._subscribers = folder, scans, subscribers
+    def __init__(self, folder: Path, scans: int, subscribers: int, half_round_s: float) -> None:
+        self._folder, self._scans, self._subscribers, self._half_round_s = folder, scans, subscribers, half_round_s
+        self._crashes = CrashWatch()
         self._address, self._port = PORTS.address(), PORTS.take()
         self._pids: dict[str, int] = {}
         self._last_scan_s = time.monotonic()
@@ -175,12 +178,13 @@ class Attacked:
             process.terminate()
             process.wait()
             reader.join()
-        return wrong or list(self._wrong_with_record())
+        return [*(wrong or self._wrong_with_record()), *self._crashes.in_logs(self._folder)]
 
     def _attack(self, process: subprocess.Popen[str]) -> list[str]:
         self._is_open.wait(STALLED_S)
-        crowd = Crowd(self._address, self._subscribers)
-        crowd.start()
+        crowds = [Crowd(self._address, self._subscribers // CROWDS, self._half_round_s) for _ in range(CROWDS)]
+        for crowd in crowds:
+            crowd.start()
         try:
             with _viewers(f"http://127.0.0.1:{self._port}"):
                 while process.poll() is None:
@@ -189,11 +193,14 @@ class Attacked:
                         return [f"no scan within {STALLED_S:g} s: it stands still"]
                     time.sleep(0.5)
         finally:
-            crowd.close()
-        print(
-            f"{crowd.rounds} crowds of {self._subscribers} got {crowd.received} packets ({crowd.distinct} different "
-            f"ones), one of them {crowd.most}; the scheduler took up to {self.most_mb:.0f} MB"
-        )
+            for crowd in crowds:
+                crowd.close()
+        for crowd in crowds:
+            print(
+                f"{crowd.rounds} crowds of {self._subscribers // CROWDS} got {crowd.received} packets "
+                f"({crowd.distinct} different ones), one of them {crowd.most}"
+            )
+        print(f"the scheduler took up to {self.most_mb:.0f} MB")
         wrong = [] if process.returncode == 0 else [f"exit code {process.returncode}"]
         if self.most_mb > MOST_MB:
             wrong.append(f"the scheduler grew to {self.most_mb:.0f} MB, over {MOST_MB:g}")
@@ -233,9 +240,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--scans", type=int, default=40)
     parser.add_argument("--subscribers", type=int, default=200)
+    parser.add_argument("--half-round", type=float, default=15.0, metavar="S", help="time that each crowd stays")
     options = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="crowd-"))
-    wrong = Attacked(folder, options.scans, options.subscribers).run()
+    wrong = Attacked(folder, options.scans, options.subscribers, options.half_round).run()
     if wrong:
         print(f"{'; '.join(wrong)} ({folder})")
         return 1

@@ -15,13 +15,14 @@ from afspm.basics.clock import ExperimentClock
 from afspm.basics.launch import Launch, Sockets
 from afspm.storage.packet_log import expect_recorder, log_folder
 from afspm.supervisor.ports import FreePorts
+from benchmarks.crashes import CrashWatch
 
 CLOCK = ExperimentClock.real()
 PORTS = FreePorts()
 
 
 class Roles(ExitStack):
-    """Starts processes, and ends them at the end of the block.
+    """Starts processes, and ends them at the end of the block; raises RuntimeError if one has crashed by then.
 
     Attributes:
         run_folder: of the scheduler started last; its record, if any, is there.
@@ -31,6 +32,7 @@ class Roles(ExitStack):
         super().__init__()
         self.processes: list[subprocess.Popen[Any]] = []
         self.run_folder = Path()
+        self._crashes = CrashWatch()
 
     def start(self, role: str, **arguments: Any) -> str:
         """Start a process of `benchmarks.roles`; return its line when it is ready."""
@@ -38,7 +40,7 @@ class Roles(ExitStack):
             [sys.executable, "-m", "benchmarks.roles", role, json.dumps(arguments)], stdout=subprocess.PIPE, text=True
         )
         self.processes.append(process)
-        self.callback(_end, process)
+        self.callback(self._end, process)
         assert process.stdout is not None
         return process.stdout.readline().strip()
 
@@ -116,21 +118,23 @@ class Roles(ExitStack):
     def _host(self, launch: Launch) -> None:
         process = subprocess.Popen([sys.executable, "-m", "afspm.supervisor.host"], stdin=subprocess.PIPE)
         self.processes.append(process)
-        self.callback(_end, process)
+        self.callback(self._end, process)
         assert process.stdin is not None
         process.stdin.write(launch.to_json().encode() + b"\n")
         process.stdin.flush()
+
+    def _end(self, process: subprocess.Popen[Any]) -> None:
+        for stream in (process.stdin, process.stdout):
+            if stream is not None:
+                stream.close()
+        crashes = self._crashes.of(process)
+        process.kill()
+        process.wait()
+        if crashes:
+            raise RuntimeError(f"a process has crashed: {crashes}")
 
 
 @contextmanager
 def roles() -> Iterator[Roles]:
     with Roles() as started:
         yield started
-
-
-def _end(process: subprocess.Popen[Any]) -> None:
-    for stream in (process.stdin, process.stdout):
-        if stream is not None:
-            stream.close()
-    process.kill()
-    process.wait()

@@ -22,6 +22,7 @@ from afspm.basics.plain_data import Plain, from_json
 from afspm.night.bad_scans import BAD, last_scores
 from afspm.night.run import open_run
 from benchmarks.compare import ROOT
+from benchmarks.crashes import CrashWatch
 
 EXPERIMENTS = ROOT / "experiments"
 SCANNERS = ("simulator", "stm-4k")
@@ -39,6 +40,7 @@ def night(name: str, scanner: str, folder: Path) -> tuple[Path, bool]:
     if overlay.exists():
         files.append(overlay)
     command = [sys.executable, "-m", "afspm", "run", *map(str, files), "--runs", str(folder / scanner)]
+    watch = CrashWatch()
     with (
         (folder / f"{scanner}.log").open("w", encoding="utf-8") as log,
         subprocess.Popen(command, cwd=EXPERIMENTS, stdout=log, stderr=log) as process,
@@ -51,6 +53,8 @@ def night(name: str, scanner: str, folder: Path) -> tuple[Path, bool]:
             subprocess.run(end, check=False, stdout=log, stderr=log)  # the night may just be ending by itself
             process.wait(LONGEST_S)
             ended = False
+    if crashes := watch.in_logs(folder / scanner):
+        raise RuntimeError(f"a process has crashed: {crashes}")
     return folder / scanner / "latest", ended
 
 

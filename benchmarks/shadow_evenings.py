@@ -38,6 +38,7 @@ from afspm.report.shadow import FILE, ShadowKind
 from afspm.simulation.emulation.emulator import Emulator
 from afspm.translator.trace import FILE as TRACE
 from afspm.translator.trace import TracedExchange, TraceHeader, trace_lines
+from benchmarks.crashes import CrashWatch
 from benchmarks.effort import effort
 from benchmarks.experiment import ROOT
 
@@ -284,6 +285,7 @@ def watched(maker: str, plan: str, speed: float) -> Path:
     names = {"person": one.person.__name__, "emulator": one.emulator, "microscope": one.microscope}
     file.write_text(EXPERIMENT.format(speed=speed, plan=plan, **names), encoding="utf-8")
     command = (sys.executable, "-m", "afspm", "shadow", "--on", maker, str(file), "--runs", str(folder))
+    watch = CrashWatch()
     with (folder / "output.txt").open("w", encoding="utf-8") as output:
         # the classes of this module are the processes' controllers
         shadow = subprocess.Popen(command, stdout=output, stderr=output, env={**os.environ, "PYTHONPATH": str(ROOT)})
@@ -291,6 +293,8 @@ def watched(maker: str, plan: str, speed: float) -> Path:
             Event().wait(LOOKS_S)
         shadow.send_signal(signal.SIGINT)
         shadow.wait()
+    if crashes := watch.in_logs(folder):
+        raise RuntimeError(f"a process has crashed: {crashes}")
     return next(file.parent for file in folder.glob("*/shadow.csv"))
 
 
