@@ -134,7 +134,7 @@ def test_requests_of_the_scheduler_go_first() -> None:
 
 def test_the_queue_is_bounded() -> None:
     forwarder = up(longest_queue=3)
-    results = [forwarder.ask(job(str(n)), 0.0) for n in range(10)]
+    results = [forwarder.ask(job(str(n), command=False), 0.0) for n in range(10)]
     refused = [result for result in results if isinstance(result, SettledRequest)]
     assert len(refused) == 7
     assert all(r.response.detail is ResponseDetail.NOT_SENT for r in refused)
@@ -220,3 +220,32 @@ def test_forgotten_ids_are_known_after_a_restart() -> None:
     assert after.look_up("exp", numbered(1)) is RequestStatus.FORGOTTEN
     assert after.look_up("exp", numbered(399)) is RequestStatus.UNKNOWN
     assert after.look_up("exp", numbered(400)) is None
+
+
+def test_clients_take_turns_and_commands_go_before_the_reads_of_others() -> None:
+    # faults A2
+    forwarder = up()
+    for n in range(5):
+        forwarder.ask(job("flooder", f"f{n}", command=False), 0.0)
+    assert sends(forwarder, 0.0) == [1]
+    forwarder.ask(job("reader", "r0", command=False), 0.0)
+    forwarder.ask(job("reader", "r1", command=False), 0.0)
+    forwarder.ask(job("holder", "h0"), 0.0)
+    forwarder.ask(job("holder", "h1", command=False), 0.0)
+    forwarder.ask(job("holder", "h2"), 0.0)
+    ids = [waiting.request.id for waiting in forwarder.queue]
+    assert ids == ["h0", "f1", "r0", "f2", "r1", "h1", "h2", "f3", "f4"]
+
+
+def test_flooding_client_keeps_out_no_other_and_is_named_once() -> None:
+    # faults A2
+    forwarder = up(most_of_client=3)
+    flood = [forwarder.ask(job("flooder", command=False), 0.0) for _ in range(20_000)]
+    assert len([refused for refused in flood if refused is not None]) == 20_000 - 3
+    assert forwarder.flooders == ("flooder",)
+    assert forwarder.ask(job("other", command=False), 1.0) is None
+    for n in range(100):
+        forwarder.ask(job(f"name {n}", command=False), 1.0)
+    assert forwarder.ask(job("holder"), 2.0) is None
+    assert forwarder.queue[0].client == "holder"
+    assert forwarder.deadline_s() == 5.0

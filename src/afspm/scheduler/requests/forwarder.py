@@ -2,12 +2,13 @@
 
 A translator serves one request after the other and is silent meanwhile. So one request is in flight. The others wait
 here, where they can still be removed; a request that has waited too long is answered unsent. The queue keeps the order
-and the times. Whether a request is sent, and in which form, is decided when its turn comes
-(`request_pipeline.send_next`).
+and the times. In it, commands go before reads, and the clients take turns, so that no client holds up the others.
+Whether a request is sent, and in which form, is decided when its turn comes (`request_pipeline.send_next`).
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum, auto
@@ -133,7 +134,9 @@ class Forwarder:
     Attributes:
         timeout_s: the real time that a client waits for an answer.
         patience_s: the further time to wait for an overdue answer before the next request is sent.
-        longest_queue: the largest number of waiting requests.
+        longest_queue: the largest number of waiting requests, without commands.
+        most_of_client: the largest number of waiting requests of one client.
+        flooders: the clients, newest last, of which requests were refused since `most_of_client` waited.
         up: whether the translator is connected.
         number: the number of the newest request.
         flight: the request that the translator is serving.
@@ -146,6 +149,8 @@ class Forwarder:
     timeout_s: float = 5.0
     patience_s: float = 5.0
     longest_queue: int = 64
+    most_of_client: int = 8
+    flooders: tuple[str, ...] = ()
     up: bool = False
     number: int = 0
     flight: ForwardedRequest | None = None
@@ -182,10 +187,28 @@ class Forwarder:
         """Queue a client's request; return its refusal if it can't be queued."""
         if not self.up:
             return self, _not_sent(job, "the translator is not connected")
-        if len(self.queue) >= self.longest_queue:
+        if sum(other.client == job.client for other in self.queue) >= self.most_of_client:
+            flooders = tuple(client for client in self.flooders if client != job.client)
+            # bounded: the names are the clients' choice
+            forwarder = replace(self, flooders=(*flooders, job.client)[-self.longest_queue :])
+            return forwarder, _not_sent(job, f"{self.most_of_client} requests of {job.client} wait already")
+        # the reads of many names must not keep out a command
+        if not job.command and len(self.queue) >= self.longest_queue:
             return self, _not_sent(job, f"{self.longest_queue} requests wait for the translator already")
         job = job._replace(number=self.number + 1, deadline_s=now_s + self.timeout_s)
-        return replace(self, number=job.number, queue=(*self.queue, job)), None
+        at = self._place(job)
+        return replace(self, number=job.number, queue=(*self.queue[:at], job, *self.queue[at:])), None
+
+    def _place(self, job: ForwardedRequest) -> int:
+        # behind all requests of its client, and those that are as few requests of their own clients from being sent
+        turns, of_clients = list[tuple[bool, int]](), Counter[str]()
+        for other in (*self.queue, job):
+            turns.append((not other.command, of_clients[other.client]))
+            of_clients[other.client] += 1
+        at = len(self.queue)
+        while at and self.queue[at - 1].client != job.client and turns[-1] < turns[at - 1]:
+            at -= 1
+        return at
 
     def ask_own(
         self, request: Request, now_s: float, purpose: OwnPurpose | None = None, mapped: MappedRequest | None = None
@@ -268,7 +291,7 @@ class Forwarder:
 
     def deadline_s(self) -> float | None:
         """Return the real time at which `expired` is due; None: no request waits or is in flight."""
-        times = [jobs[0].deadline_s for jobs in (self.own, self.queue) if jobs]
+        times = [job.deadline_s for job in (*self.own, *self.queue)]
         if self.flight is not None:
             times.append(self._patience_ends_s(self.flight) if self.flight.answered else self.flight.deadline_s)
         return min(times, default=None)

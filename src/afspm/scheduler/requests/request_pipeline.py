@@ -4,7 +4,7 @@
 | --- | --- | --- |
 | 1. admitted | at arrival | session, idempotency |
 | 2. authorised | at arrival, and again when it is sent | the arbitration table |
-| 3. queued | at arrival | the forwarder: one line to the translator, in order |
+| 3. queued | at arrival | the forwarder: one line to the translator, in which the clients take turns |
 | 4. within limits | when its turn comes, right before it is sent | limits, coordinate frame, the microscope itself |
 | 5. settled | at the answer, or when the answer is overdue | the translator, or a timeout |
 
@@ -315,7 +315,14 @@ def enqueue(draft: StateDraft, event: RequestIn) -> None:
     if instrument_requests.is_for_instrument(draft, event):
         instrument_requests.ask(draft, event, job, _not_allowed_now)
         return
+    known = draft.forwarder.flooders
     draft.forwarder, refused = draft.forwarder.ask(job, draft.now_s)
+    if name in draft.forwarder.flooders and name not in known:
+        most = draft.forwarder.most_of_client
+        why = (
+            f"{name} asks faster than the translator answers: {most} of its requests wait, and further ones are refused"
+        )
+        draft.log("WARNING", f"{why}; let it wait for each answer")
     if refused is None:
         draft.idempotency = draft.idempotency.noted(name, request, RequestStatus.PENDING)
     else:
