@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -50,7 +51,9 @@ from afspm.night.treatment_ledger import KEEP_AWAY_M, TreatmentLedger, treatment
 from afspm.record import REPLAY_OF, journal, latest_run
 from afspm.record.instrument_values import RecordedReadings
 from afspm.record.journal import SCHEDULER
-from afspm.record.run_json import EXPERIMENT_FILE, METADATA, run_json_or_empty
+from afspm.record.run_json import EXPERIMENT_FILE, METADATA, STATE_DIR, run_json_or_empty
+from afspm.record.run_lock import is_locked, unrecorded_message
+from afspm.storage.packet_log import log_folder
 from afspm.wire import described_types
 from afspm.wire.message_types import register_all
 from afspm.wire.messages import SpatialROIWithScoreList, TipVerdict, WatchCounts
@@ -64,11 +67,14 @@ if TYPE_CHECKING:
     from afspm.storage.formats.content import FileContent
 
 _SAME_SCAN_NS = 1_000_000_000
+_log = logging.getLogger("afspm.night")
 
 
 @checked({"path": PATH})
 def open_run(path: str | Path = "runs", *, messages: Sequence[str] = ()) -> Run:
     """Open the record of a run, also of a running or killed one.
+
+    A warning is logged if the packet log of a stopped run has results that are not recorded.
 
         run = afspm.open_run("runs/tip_repair-20261120-040000")
         run.scan(-1)["height"].to_xarray()
@@ -84,7 +90,10 @@ def open_run(path: str | Path = "runs", *, messages: Sequence[str] = ()) -> Run:
         ConfigError: `messages` can't be imported.
     """
     register_all(messages)
-    return Run(_folder(Path(path)))
+    run = Run(_folder(Path(path)))
+    if not is_locked(run.folder) and (lacking := unrecorded_message(run.folder, log_folder(run.folder / STATE_DIR))):
+        _log.warning("%s: %s", run.folder, lacking)
+    return run
 
 
 class Run:

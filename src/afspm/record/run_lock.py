@@ -11,9 +11,12 @@ from pathlib import Path, PurePath
 
 from afspm.basics.errors import FileError
 from afspm.basics.file_lock import lock
+from afspm.basics.formatting import counted
 from afspm.record.run_json import COMPUTER, ENDED, REPLAY_OF, STATE_DIR, run_json_or_empty
+from afspm.storage.packet_log import LogReader, committed
 
 LOCK_FILE = "running"
+_MOST_COUNTED_BYTES = 32 << 20  # takes a fraction of a second: the supervisor does not wait for a recorder for long
 
 
 @contextlib.contextmanager
@@ -61,6 +64,21 @@ def cut_off_message(folder: Path) -> str:
     if REPLAY_OF in facts:
         return "this replay was cut off"
     return f"it was cut off; {resume_command(folder)} goes on with it"
+
+
+def unrecorded_message(folder: Path, log: Path) -> str:
+    """Return a message about results in a run's packet log that are not recorded; empty without such results."""
+    if (position := committed(log)) is None:
+        return ""
+    reader = LogReader(log, position)
+    try:
+        envelopes = [entry.packet.envelope for entry, _ in reader.read(_MOST_COUNTED_BYTES)]
+    except OSError as error:
+        return f"the packet log of the run can't be read, results in it may not be recorded: {error}"
+    if not (count := sum(envelope.startswith(("Scan2d", "Spec1d")) for envelope in envelopes)):
+        return ""
+    waiting = f"{'at least ' if reader.is_cut else ''}{counted(count, 'channel')} of scans and spectra"
+    return f"the record lacks {waiting} that the packet log still has; {resume_command(folder)} records them"
 
 
 def other_computer(folder: Path) -> str:

@@ -26,7 +26,9 @@ from afspm.experiment import Role, implied_parts
 from afspm.model.events import LOGGED_AS
 from afspm.night.run import open_run
 from afspm.record.journal import JOURNAL_FILE
-from afspm.record.run_lock import quoted, resume_command
+from afspm.record.run_json import STATE_DIR
+from afspm.record.run_lock import quoted, resume_command, unrecorded_message
+from afspm.storage import log_folder
 from afspm.storage.disk import DiskTimeout, run_bounded
 from afspm.supervisor.supervision.run_end import EndReason
 from afspm.transport.process import signals
@@ -95,7 +97,7 @@ def summary(outcome: RunOutcome, folder: Path) -> list[str]:
         how_often = _times(outcome.waits_given_up)
         lines.append(f"simulated time went on {how_often} without a process that was behind: scans may be late")
     try:
-        lines += run_bounded(lambda: _counts_of_record(folder) or _counts_of_table(folder / TABLE), COUNTED_WITHIN_S)
+        lines += run_bounded(lambda: _counts(folder), COUNTED_WITHIN_S)
     except DiskTimeout as error:
         lines.append(f"what was measured can't be counted: {error}")
     lines.append(f"everything is in {folder}")
@@ -110,6 +112,11 @@ def _would_fail_again(outcome: RunOutcome) -> bool:
     # a resumed run has the settings with which it began
     given_up = [report for report in outcome.reports if report.given_up]
     return bool(given_up) and all(report.misconfigured for report in given_up)
+
+
+def _counts(folder: Path) -> list[str]:
+    lacking = unrecorded_message(folder, log_folder(folder / STATE_DIR))
+    return [*(_counts_of_record(folder) or _counts_of_table(folder / TABLE)), *([lacking] if lacking else [])]
 
 
 def _counts_of_record(folder: Path) -> list[str]:

@@ -158,6 +158,22 @@ def test_record_that_is_removed_in_a_run_is_logged_once(bench: Bench, caplog: py
     assert caplog.text.count("was removed") == 1
 
 
+def test_open_run_names_the_results_that_wait_in_the_log(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    # faults A3
+    image = Scan(Region((0.0, 0.0), (1e-6, 1e-6)), "Height", "m", np.zeros((4, 4)))
+    bench.publish(control(1))
+    bench.writer().finish(ended=False)
+    bench.publish(*(Packet("Scan2d_Height", wire.encode(image)[1], time_ns) for time_ns in (100, 200)))
+    with afspm.open_run(bench.folder):
+        lacking = "the record lacks 2 channels of scans and spectra that the packet log still has; `afspm run --resume "
+        assert caplog.text.count(lacking) == 1
+    bench.writer().finish(ended=False)
+    caplog.clear()
+    with afspm.open_run(bench.folder) as run:
+        assert len(run.scans) == 2
+    assert not caplog.text
+
+
 def test_restarted_recorder_continues_at_the_committed_position(bench: Bench) -> None:
     bench.publish(*map(control, range(1, 6)))
     bench.writer().finish(ended=False)
