@@ -164,7 +164,7 @@ class Attacked:
         (self._folder / "experiment.toml").write_text(EXPERIMENT.format(**given), encoding="utf-8")
         (self._folder / "chatterbox.py").write_text(CHATTERBOX, encoding="utf-8")
         process = subprocess.Popen(
-            [sys.executable, "-m", "afspm", "run", "experiment.toml", "--verbose"],
+            [sys.executable, "-m", "afspm", "run", "experiment.toml", "--verbose", "--no-report"],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,

@@ -136,7 +136,7 @@ class Forwarder:
         patience_s: the further time to wait for an overdue answer before the next request is sent.
         longest_queue: the largest number of waiting requests, without commands.
         most_of_client: the largest number of waiting requests of one client.
-        flooders: the clients, newest last, of which requests were refused since `most_of_client` waited.
+        flooders: the clients that exceeded `most_of_client`, newest last.
         up: whether the translator is connected.
         number: the number of the newest request.
         flight: the request that the translator is serving.
@@ -200,7 +200,7 @@ class Forwarder:
         return replace(self, number=job.number, queue=(*self.queue[:at], job, *self.queue[at:])), None
 
     def _place(self, job: ForwardedRequest) -> int:
-        # behind all requests of its client, and those that are as few requests of their own clients from being sent
+        # behind all requests of its client, and behind each request with as many or fewer of its own client before it
         turns, of_clients = list[tuple[bool, int]](), Counter[str]()
         for other in (*self.queue, job):
             turns.append((not other.command, of_clients[other.client]))
