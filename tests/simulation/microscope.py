@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 from afspm import wire
 from afspm.basics.errors import InvalidValue
 from afspm.basics.exit_codes import ExitCode
+from afspm.basics.plain_data import Plain
 from afspm.model import (
     ActByHand,
     ControlRequest,
@@ -132,7 +134,7 @@ class FakeMicroscope(Process):
         self.panel: MakerPanel | None = None
         self.turned: set[str] = set()
         self._codec = codec
-        self._kept: KeptState = {}  # on its disk
+        self._kept: Plain = {}  # on its disk
         self._newest_ns = 0
         self._history: deque[Packet] = deque(maxlen=_HISTORY)
         self._forget()
@@ -204,7 +206,7 @@ class FakeMicroscope(Process):
         self._serve()
 
     def _handle(self, request: Request) -> Response:
-        outcomes = RequestOutcomes(self._kept, all_or_nothing=False)
+        outcomes = RequestOutcomes(cast(KeptState, self._kept), all_or_nothing=False)
         if (known := outcomes.outcome(request)) is not None:
             return known
         code = self._carry_out(request)

@@ -325,7 +325,7 @@ def test_tip_that_is_not_shown_and_was_moved_by_hand_is_never_engaged(
 def test_pause_goes_on_after_a_kill_right_before_the_mode_is_set(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    set_mode, reached = QuietHours._set_mode, []
+    set_mode, reached = QuietHours._set_mode, list[str]()
 
     def killed_before(component: QuietHours, mode: ControlMode) -> str:
         if not reached:
