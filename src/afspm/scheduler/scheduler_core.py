@@ -152,7 +152,7 @@ class SchedulerCore:
             # a start sent before the kill may be known to the translator alone
             until_s = now_s + self._env.settings.control.request_timeout_s
             draft.microscope = draft.microscope.expecting(*STARTED.values(), until_s=until_s)
-            draft.others_may_have_acted()
+            draft.others_may_have_acted(unseen=True)
             self._env.cache.remember(self._restored.recent)
             starts = self._restored.starts
             draft.event_log = draft.event_log.restored(starts, self._entries_since(starts), now_s, now_ns)
@@ -303,7 +303,7 @@ def _on_translator_up(draft: StateDraft, event: TranslatorUp) -> None:
     draft.forwarder, settled = draft.forwarder.connected()
     for one in settled:
         request_pipeline.settle(draft, one)
-    draft.others_may_have_acted()
+    draft.others_may_have_acted(unseen=True)
     safety_commands.begin(draft)
     request_pipeline.read_ahead(draft)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from functools import partial
 
 from afspm.basics.frozen import replace
 from afspm.model import ControlMode, component_of
@@ -201,10 +202,11 @@ class StateDraft(StateParts):
         """Save the state after this step even if none of its `saved_parts` changed."""
         self._is_to_be_saved = True
 
-    def others_may_have_acted(self, by: str = "") -> None:
-        """Forget where the tip and its motor are; `by` is the client that ends MANUAL, whose word on them counts."""
+    def others_may_have_acted(self, *, unseen: bool = False, by: str = "") -> None:
+        """Forget where the tip and its motor are. The arguments are those of `MoverState.unknown`."""
         shown = self.panel.tip.engaged
-        self.limits = self.limits.with_movers(lambda state: state.unknown(at_sample=shown is True, by=by))
+        change = partial(MoverState.unknown, at_sample=shown is True, unseen=unseen, by=by)
+        self.limits = self.limits.with_movers(change)
         if shown is not False:
             self.microscope = self.microscope.with_tip(away=False)
 

@@ -137,7 +137,7 @@ def _update_scope_state(draft: StateDraft, state: ScopeState) -> None:
     elif state is ScopeState.INTERRUPTED:
         draft.limits = draft.limits.with_movers(MoverState.interrupted)
     elif state is ScopeState.UNDEFINED:
-        draft.others_may_have_acted()
+        draft.others_may_have_acted(unseen=True)
     draft.watchdog = draft.watchdog.state_reported(draft.microscope)
     approvals.state_changed(draft, before)
     if draft.microscope.is_free != before.is_free:

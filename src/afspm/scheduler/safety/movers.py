@@ -9,9 +9,10 @@
 The two readings are `PROVED_AFTER_S` apart. A request counts from the moment at which it is sent. With an unknown
 outcome, a move counts as made, and steps away do not.
 
-No controller shows its motor. So steps away, a person's word and the proof end wherever others may have used it unseen
-(`MoverState.unknown`): with MANUAL (its begin and its end), a lost contact, and a restart of translator or scheduler.
-The ways, and the approach that is needed, stay; a way then means "at least".
+No controller shows its motor. So steps away and a person's word end wherever others may have used it
+(`MoverState.unknown`): with MANUAL (its begin and its end), an act by hand, a lost contact, and a restart of translator
+or scheduler; the last three end the proof, too. The ways, and the approach that is needed, stay; a way then means "at
+least".
 """
 
 from __future__ import annotations
@@ -150,16 +151,17 @@ class MoverState:
         """Forget how far the tip was: it comes to the sample, is there, or moves as nothing here knows."""
         return replace(self, pending={}, answered=0, retracted=0, is_unknown=False, cleared_by="")
 
-    def unknown(self, *, at_sample: bool, by: str = "") -> MoverState:
-        """Forget the steps away and the proof: others may have used the motor.
+    def unknown(self, *, at_sample: bool, unseen: bool, by: str = "") -> MoverState:
+        """Forget the steps away, and the proof if the tip may have been away: others may have used the motor.
 
         Args:
             at_sample: whether the tip was last shown there; otherwise it is unproved anyway once it is back.
+            unseen: whether the tip may have left the sample and come back without a reading in between.
             by: who ends MANUAL; a word of the same client counts for what follows.
         """
         word = self.cleared_by if self.cleared_by == by else ""
         state = replace(self.near(), is_unknown=not at_sample, cleared_by=word, at_sample_ns=None)
-        return replace(state, is_unproved=self.is_unproved or at_sample)
+        return replace(state, is_unproved=self.is_unproved or (at_sample and unseen))
 
     def withdrawn(self) -> MoverState:
         """Forget the steps away, since a withdrawal may end them."""
