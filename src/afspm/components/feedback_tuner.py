@@ -61,7 +61,8 @@ class FeedbackTuner(FeedbackObserver):
             if not self.scope.wait_until(self._is_wanted, timeout_s=BACK_WITHIN_S if "gain" in self.memory else None):
                 continue
             try:
-                with self.scope.control(solving=Problem.FEEDBACK_NON_OPTIMAL):
+                # a scan that is repeated after a person has had the microscope is none of the gain that was tried
+                with self.scope.control(solving=Problem.FEEDBACK_NON_OPTIMAL, unbroken=True):
                     self._tune()
             except ControlLost as lost:
                 self.log.info("the search is over: %s", lost.what)
@@ -115,6 +116,7 @@ class FeedbackTuner(FeedbackObserver):
             self.log.warning("integral gain %g was refused: %s", gain, refused.reason)
             return None
         self.memory["way"] = [*self.memory["way"], gain]
+        self.memory["in_force"] = self.scope.feedback and self.scope.feedback.integral_gain
         self.memory.save()
         scans = self.scope.scan()
         held = self.held_channel()
@@ -159,8 +161,12 @@ class FeedbackTuner(FeedbackObserver):
         gain = self.memory.get("gain")
         if gain is None:
             return True
+        now, own = self.scope.feedback and self.scope.feedback.integral_gain, self.memory.get("in_force")
         try:
-            self._go_back_to(gain, timeout_s)
+            if own is None or now is None or now == own:
+                self._go_back_to(gain, timeout_s)
+            else:
+                self.log.warning("integral gain %g stays: others have set it since", gain := now)
         except Refused as refused:
             text = "integral gain %g can't be set again: %s. The feedback in force is %s; set a gain by hand"
             self.log.critical(text, gain, refused.reason, self.scope.feedback)
@@ -171,6 +177,7 @@ class FeedbackTuner(FeedbackObserver):
             is_back = True
         del self.memory["gain"]
         self.memory.pop("way", None)
+        self.memory.pop("in_force", None)
         self.memory.save()
         return is_back
 

@@ -209,6 +209,7 @@ class StateDraft(StateParts):
         self.limits = self.limits.with_movers(change)
         if shown is not False:
             self.microscope = self.microscope.with_tip(away=False)
+        self.instruments = self.instruments.changed(self.now_s)
 
     def log(self, level: str, text: str) -> None:
         self.effects.append(Log(level, text))

@@ -55,7 +55,8 @@ def commanding(address: str, run: str) -> Iterator[Callable[[str], None]]:
                 held.add(name)
 
         def take_identity(identity: str) -> None:
-            if is_here and identity:
+            # the first one counts: a person may choose another folder, and a lost controller must be reached again
+            if is_here and names and identity and held <= names:
                 take(identity, f"{address}, {identity}")
 
         for name in sorted(names):  # in one order: of two runs that begin together, one gets them all

@@ -213,7 +213,7 @@ class HeldZ:
         if found is None:
             return
         if why and not found["why"]:
-            found["why"] = why
+            found["why"], found["moved"] = why, True  # others may have moved the tip, or time the surface
             self._log.warning("z is held no more: %s", why)
         if found["phase"] != _FAILED:
             found["phase"] = _BACK

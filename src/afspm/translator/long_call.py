@@ -51,7 +51,7 @@ class LongCall:
         self.what = what
         self.value: Any = None
         self._link, self._is_unfinished, self._is_seen = link, is_unfinished, is_seen
-        self._seen_s = time.monotonic()
+        self._unseen_s: float | None = None
         self._came = False
 
     def running(self) -> bool:
@@ -70,8 +70,10 @@ class LongCall:
         # a controller that takes a command and loses it would be waited for without an end
         now_s = time.monotonic()
         if self._is_seen():
-            self._seen_s = now_s
-        elif now_s - self._seen_s >= SHOWS_S:
+            self._unseen_s = None
+        elif self._unseen_s is None:  # the time counts from a look, since this process may have been busy before it
+            self._unseen_s = now_s
+        elif now_s - self._unseen_s >= SHOWS_S:
             problem = f"the {self.what} has no answer, and has not run for {SHOWS_S:g} s: it never began, or is over"
             raise ControllerSilent(problem, hint="look at the controller's screen, and at the tip")
 

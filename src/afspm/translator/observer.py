@@ -369,6 +369,7 @@ class Observer:
                 if self._spoils(act):
                     self._spoil(str(act))
         if acts:
+            self._temporary.held.moves_aside()
             self._state.save()
         for act in acts:
             self._port.publish(*wire.encode(act), self._state.stamp()[0])

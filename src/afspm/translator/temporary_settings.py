@@ -47,11 +47,11 @@ class TemporarySettings:
         """
         values = {name: self._driver.table[name].checked(value) for name, value in values.items()}
         former = self._driver.in_force(values.keys())
-        self._kept[_KEY] = {"former": former, "until_s": self._driver.clock.now_s() + for_s}
+        self._kept[_KEY] = {"former": former, "set": values, "until_s": self._driver.clock.now_s() + for_s}
         self._state.save()  # before any change: a kill must not lose the former values
         try:
             if values:
-                apply(self._driver, values)
+                self._kept[_KEY]["set"] = {**values, **apply(self._driver, values)}
         except LOST:
             raise  # the outcome is unknown: the former values are restored when the controller is reconnected
         except Exception:  # raised again: `apply` has restored the former values
@@ -92,7 +92,7 @@ class TemporarySettings:
     def end(self) -> None:
         """Restore the former values, if any, and begin the way back of a held z.
 
-        Values that the controller refuses are logged and given up.
+        A value that others have changed meanwhile stays. Values that the controller refuses are logged and given up.
 
         Raises:
             an error in `LOST`.
@@ -101,9 +101,14 @@ class TemporarySettings:
         found = self._kept.get(_KEY)
         if found is None:
             return
+        former: dict[str, Value] = found["former"]
         try:
-            if found["former"]:
-                apply(self._driver, found["former"])
+            now = self._driver.in_force(former)
+            left = [name for name in former if not self._driver.same(name, found.get("set", now)[name], now[name], now)]
+            if left:
+                self._log.warning("not set back, since others have set it meanwhile: %s", ", ".join(left))
+            if former := {name: value for name, value in former.items() if name not in left}:
+                apply(self._driver, former)
         except LOST:
             raise
         except Exception as error:  # a driver may raise anything; a person must learn the values to restore

@@ -119,6 +119,19 @@ def test_setpoint_beyond_the_preamplifier_is_refused(bench: Make) -> None:
     assert made.emulator.rig.setup.feedback.setpoint == pytest.approx(9e-9)
 
 
+def test_feedback_is_not_switched_on_beyond_the_reach_of_another_gain(bench: Make) -> None:
+    made, peer = lenient(bench)
+    assert peer.set(names.ZCTRL_SETPOINT, "9", "nA").ok
+    assert peer.ask(ControlRequest.ACTION, names.RETRACT).ok
+    made.at_panel(lambda emulator: emulator.software.core.registers.put("Current.Gain", 8))
+    for response in (
+        *(peer.ask(ControlRequest.ACTION, one) for one in (names.ENGAGE, names.APPROACH)),
+        peer.set(names.FEEDBACK_ON, "true"),
+    ):
+        assert "9 nA is not below the preamplifier's range, 100 pA by its gain 'LN 10^11'" in response.reason
+    assert not made.emulator.rig.engaged
+
+
 def test_unknown_preamplifier_is_named_and_can_be_given(bench: Make) -> None:
     made = bench()
     made.at_panel(lambda emulator: emulator.software.core.registers.put("Current.Gain", 99))
@@ -233,6 +246,6 @@ def test_step_of_the_coarse_motor_needs_a_withdrawn_tip(bench: Make) -> None:
     assert response.code == ControlResponse.ACTION_ERROR
     assert "the tip is at the sample: withdraw it first (x-retract)" in response.reason
     assert made.emulator.rig.doing(made.clock.now_s()) == ""
-    assert peer.act(names.RETRACT).ok
+    assert peer.ask(ControlRequest.ACTION, names.RETRACT).ok
     peer.until(ScopeState.FREE)
     assert peer.act("x-step").ok

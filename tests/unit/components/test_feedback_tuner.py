@@ -149,10 +149,24 @@ def test_original_gain_is_restored_after_a_kill(tmp_path: Path) -> None:
     run(tuner(), killed, tmp_path)
     assert killed.gains[-1] != BEFORE
     later = Rig(lambda gain: off_by(0.5))
+    later.publish(Feedback(on=True, integral_gain=killed.gains[-1]))
     later.clear(Problem.FEEDBACK_NON_OPTIMAL)
     later.at(250.0, later.kill)
     run(tuner(), later, tmp_path)
     assert later.gains == [BEFORE]
+
+
+def test_gain_of_a_person_stays_after_a_kill(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    killed = Rig(lambda gain: off_by(0.5))
+    killed.at(250.0, killed.kill)
+    run(tuner(), killed, tmp_path)
+    later = Rig(lambda gain: off_by(0.5))
+    later.publish(Feedback(on=True, integral_gain=0.3))
+    later.clear(Problem.FEEDBACK_NON_OPTIMAL)
+    later.at(250.0, later.kill)
+    run(tuner(), later, tmp_path)
+    assert later.gains == []
+    assert "integral gain 0.3 stays: others have set it since" in caplog.text
 
 
 class Unscannable(Rig):

@@ -301,6 +301,19 @@ def test_controller_lost_in_a_hold_ends_it(held: Any) -> None:
     assert "the controller was lost" in act(held, names.RELEASE_Z).reason
 
 
+def test_tip_away_is_brought_back_by_the_feedback_after_a_lost_controller(
+    held: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at_offset(held, 500e-12)
+    ramp = []
+    monkeypatch.setattr(held.translator.driver, "move_z", ramp.append)
+    held.translator._connection.lose(ConnectionError("unplugged"))
+    held.look(2.0)
+    until_free(held)
+    assert ramp == [], "others may have moved the tip, and the surface may be higher"
+    assert get(held, names.FEEDBACK_ON) == "true"
+
+
 def test_run_that_ends_in_a_hold_goes_the_way_back_instead_of_withdrawing(held: Any) -> None:
     from afspm.transport.port import ParentGone
 

@@ -24,8 +24,8 @@ def test_command_is_given_up_once_nothing_of_it_is_seen_for_ten_seconds(monkeypa
     now_s, runs = [100.0], [False]
     monkeypatch.setattr(long_call, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
     call = LongCall("force", Silent(), is_seen=lambda: runs[0])
-    for now_s[0], runs[0] in ((109.0, False), (200.0, True), (209.0, False)):
+    for now_s[0], runs[0] in ((109.0, False), (118.0, False), (200.0, True), (300.0, False), (309.0, False)):
         assert call.running()
-    now_s[0] = 211.0
+    now_s[0] = 310.0
     with pytest.raises(ControllerSilent, match="the force has no answer, and has not run for 10 s"):
         call.running()

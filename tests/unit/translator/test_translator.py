@@ -870,6 +870,20 @@ def test_temporary_values_are_restored_after_a_kill_a_loss_or_the_end(make_bench
     assert microscope.values == before
 
 
+def test_temporary_value_that_a_person_has_changed_meanwhile_stays(
+    make_bench: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    bench = make_bench({"actions": {"x-pulse": BEEP}})
+    assert bench.ask(ACTION, "x-pulse").code == OK
+    bench.microscope.lost = True
+    bench.look(10.0)
+    bench.microscope.values["Bias"] = 2000.0
+    bench.microscope.lost = False
+    bench.look(10.0)
+    assert bench.microscope.values["Bias"] == 2000.0
+    assert "not set back, since others have set it meanwhile" in caplog.text
+
+
 def test_an_action_that_can_not_be_set_changes_nothing_and_is_over(make_bench: Any) -> None:
     bench = make_bench({"actions": {"x-pulse": BEEP}})
     before = dict(bench.microscope.values)

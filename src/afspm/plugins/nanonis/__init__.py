@@ -332,10 +332,17 @@ class Nanonis(Driver):
 
     def refuse_unreachable(self, values: Mapping[str, Value], before: Mapping[str, Value]) -> None:
         setpoint = values.get(names.ZCTRL_SETPOINT)
+        if values.get(names.FEEDBACK_ON):
+            self._refuse_setpoint()
         if setpoint is None or not self._holds_current:
             return
         if not self.same(names.ZCTRL_SETPOINT, before[names.ZCTRL_SETPOINT], setpoint, before):
             self._preamplifier.refuse_beyond(float(setpoint))
+
+    def _refuse_setpoint(self) -> None:
+        # right before the feedback acts on it: a person may have chosen another gain since it was set
+        if self._holds_current:
+            self._preamplifier.refuse_beyond(float(self.in_force([names.ZCTRL_SETPOINT])[names.ZCTRL_SETPOINT]))
 
     def get(self, vendor: str) -> Value:
         """Return a value by the name of its functions, see `ValueFunctions`: "Bias." means Bias.Get."""
@@ -496,12 +503,14 @@ class Nanonis(Driver):
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
         """Switch the z controller on; this also brings back a tip withdrawn by `x-retract` or the safe tip."""
+        self._refuse_setpoint()
         on = 1
         self._ask("ZCtrl.OnOffSet", on)
 
     @action(names.APPROACH, state=ScopeState.COARSE_MOTOR)
     def approach(self) -> None:
         """Start the *Auto Approach*, as set in its panel; `x-retract` stops it."""
+        self._refuse_setpoint()
         on = 1
         # its status reads off for a moment after the start, as others report
         with self._activity.occupied(ScopeState.COARSE_MOTOR, _APPROACH_SHOWS_S):

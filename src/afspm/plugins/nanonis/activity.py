@@ -61,6 +61,7 @@ class NanonisActivity(Activity):
         self._reported_path: str | None = None
         self._was_safe = False
         self._shows_until_s = 0.0
+        self._unseen_s: float | None = None
 
     # --- start and stop ---
 
@@ -82,7 +83,7 @@ class NanonisActivity(Activity):
         self._kind_asked = kind
         same_name = ""
         self._listener.curve(MODULES[kind], same_name)
-        self._shows_until_s = self._clock.monotonic_s() + _SHOWS_S
+        self._unseen_s = None
         self._await_curve(f"{MODULES[kind]}.StatusGet")
 
     def begin(self, what: str) -> None:
@@ -276,8 +277,10 @@ class NanonisActivity(Activity):
         # the blocking call waits for a day, also at a port that accepts the start and answers nothing
         now_s = self._clock.monotonic_s()
         if self._says(module, "StatusGet") or module not in self._opened:
-            self._shows_until_s = now_s + _SHOWS_S
-        elif now_s >= self._shows_until_s:
+            self._unseen_s = None
+        elif self._unseen_s is None:
+            self._unseen_s = now_s
+        elif now_s - self._unseen_s >= _SHOWS_S:
             self.end()  # a curve whose answer was lost may have a file
             problem = (
                 f"{module}.Start has no answer, and for {_SHOWS_S:g} s no curve has run: it never began, or is over"

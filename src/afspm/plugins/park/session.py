@@ -47,6 +47,7 @@ class Session:
     def __init__(self, open_link: Callable[[], Link], scanning: Collection[str], idle: Collection[str]) -> None:
         self._open_link, self._scanning, self._idle = open_link, scanning, idle
         self._link = open_link()
+        self._shows_scripts = False
         try:
             # an unknown word in an answer must be found now, not during the first scan
             self._link.ask(IS_CONNECTED)
@@ -119,7 +120,9 @@ class Session:
 
     def script_runs(self) -> bool:
         """Return True while a script runs. Raises ControllerLost: the answer is an unknown word."""
-        return self._word(SCRIPT_RUNS, TRUE, FALSE, "report it, with a trace")
+        found = self._word(SCRIPT_RUNS, TRUE, FALSE, "report it, with a trace")
+        self._shows_scripts = self._shows_scripts or found
+        return found
 
     def begin(self, what: str, expression: str, wait_s: float = 0.0) -> LongCall:
         """Start a long script on a separate connection; wait up to `wait_s` of real time for its reply.
@@ -132,14 +135,19 @@ class Session:
         """
         link = self._open_link()
         try:
-            link.ask(IS_CONNECTED)  # a connection that answers nothing must not be waited for as a long script
             link.begin(expression)
             link.wait(wait_s)
         except BaseException:  # Ctrl-C, too: nothing else closes this connection
             link.close()
             raise
         # A value of None means that SmartScan has replied before the end of the script.
-        return LongCall(what, link, lambda value: value is None and self.script_runs(), self.script_runs)
+        # Until SmartScan has shown a running script, a script that it does not show may run all the same.
+        return LongCall(
+            what,
+            link,
+            is_unfinished=lambda value: value is None and self.script_runs(),
+            is_seen=lambda: self.script_runs() or not self._shows_scripts,
+        )
 
     def start(self, what: str, expression: str, refusal: int) -> LongCall:
         """Start a long script as `begin`. Raises Refused with the code `refusal`: it fails within `ANSWERS_S`."""

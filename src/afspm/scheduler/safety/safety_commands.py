@@ -49,8 +49,9 @@ def settle(draft: StateDraft, job: ForwardedRequest, end: ForwardOutcome, respon
             draft.watchdog = draft.watchdog.done_late(subject)
         return
     if job.request.kind == ControlRequest.ACTION_SUPPORT:
-        if response.code == ControlResponse.ACTION_NOT_SUPPORTED:
-            draft.watchdog = draft.watchdog.without_retract()
+        is_refused = response.code == ControlResponse.ACTION_NOT_SUPPORTED
+        if response.ok or is_refused:
+            draft.watchdog = draft.watchdog.with_retract(is_supported=not is_refused)
         return
     if not draft.forwarder.up:
         draft.watchdog = draft.watchdog.unsent(now_s)

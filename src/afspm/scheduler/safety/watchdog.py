@@ -214,9 +214,9 @@ class Watchdog:
         """The action whose support is checked when a translator connects."""
         return self.settings.retract or names.STOP_SCAN
 
-    def without_retract(self) -> Watchdog:
-        """Register that the microscope has no action to retract."""
-        return replace(self, can_retract=False)
+    def with_retract(self, *, is_supported: bool) -> Watchdog:
+        """Register whether the microscope can retract: another translator may have been started."""
+        return replace(self, can_retract=is_supported)
 
     def people_called(self) -> Watchdog:
         return replace(self, tip=replace(self.tip, calls_people=False))
