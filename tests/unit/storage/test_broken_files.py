@@ -51,6 +51,14 @@ def test_string_heap_that_would_make_the_library_loop_is_refused(size: int) -> N
         reading(bytes(damaged), "nsid.h5")
 
 
+# found by the nightly: the process that read it ended by SIGSEGV
+def test_variable_length_of_an_unknown_kind_is_refused() -> None:
+    damaged = bytearray(whole("image.nxs"))
+    damaged[damaged.index(b"\x19\x01\x01\x00\x10\x00\x00\x00") + 1] = 0x0E
+    with pytest.raises(FileError, match="has values of an unknown type"):
+        reading(bytes(damaged), "image.nxs")
+
+
 def _by_link(file: Any, name: str, secret: Path) -> None:
     file[name] = h5py.ExternalLink(secret.name, "/values")
 

@@ -21,6 +21,7 @@ _HEAP = b"GCOL\x01\0\0\0"
 _DEEPEST = 100  # a visit takes time with the square of the depth: 1,500 groups in each other take 11 s
 _MOST_LINKS = 20_000  # to walk them takes 2 s, and 23 s with 60,000; a file of a scan has hundreds
 _OBJECT = 16  # bytes of the header of an object
+_OF_VLEN = 3  # byte of an encoded type with the kind of its variable length
 _VALUES_PER_BYTE = 16  # well compressed data; a damaged header may announce any size
 
 
@@ -33,7 +34,7 @@ def opened(path: Path) -> h5py.File:
     """Return the open file, which the caller closes.
 
     Raises:
-        FileError: the file is not HDF5, has a damaged heap, or has a part in another file.
+        FileError: the file is not HDF5, has a damaged heap or type, or has a part in another file.
         OSError: the file can't be read, or is damaged otherwise.
     """
     import h5py
@@ -50,6 +51,7 @@ def opened(path: Path) -> h5py.File:
         file = h5py.File(h5py.h5f.open_file_image(data))
     try:
         _check_links(file, path)
+        _check_types(file, path)
     except BaseException:  # after any error, Ctrl-C too, the caller has no file to close
         file.close()
         raise
@@ -81,6 +83,20 @@ def _check_links(file: h5py.File, path: Path) -> None:
         if name.count("/") > _DEEPEST:
             raise FileError(f"is refused: its groups are nested more than {_DEEPEST} deep", where=str(path))
         raise FileError(f"is refused: /{name} is in another file", where=str(path))
+
+
+def _check_types(file: h5py.File, path: Path) -> None:
+    # a variable length is of a sequence (0) or a text (1, which has a class of its own); to read values of another one
+    # ends the process with SIGSEGV (HDF5 2.0.0)
+    from h5py import h5a, h5d, h5t
+
+    nodes = [("", file["/"].id)]
+    file.visititems(lambda name, node: nodes.append((name, node.id)))
+    for name, node in nodes:
+        kinds = [h5a.open(node, index=number).get_type() for number in range(h5a.get_num_attrs(node))]
+        kinds += [node.get_type()] if isinstance(node, h5d.DatasetID) else []
+        if any(kind.get_class() == h5t.VLEN and kind.encode()[_OF_VLEN] & 0xF for kind in kinds):
+            raise FileError(f"is damaged: /{name} has values of an unknown type", where=str(path))
 
 
 def _check_heaps(data: bytes, path: Path) -> None:
