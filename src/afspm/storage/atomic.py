@@ -273,12 +273,14 @@ class CheckpointFile:
             self._thread.start()
 
     def close(self) -> None:
-        """Sync the last generation. Safe to repeat."""
+        """Sync the last generation. Safe to repeat; a later `save` starts again."""
         self._closing.set()
         with self._changed:
             self._changed.notify()
         if self._thread is not None:
             self._thread.join()
+            self._thread = None
+        self._closing.clear()
         self._let_go()
 
     def _append(self, line: bytes) -> None:

@@ -67,7 +67,10 @@ class Memory(MutableMapping[str, Any]):
             self._write(text, synced=True)
 
     def close(self) -> None:
-        """End the thread that writes; a later save starts another."""
+        """End the threads that write; a later save starts others."""
+        if (generations := self._generations) is not None:
+            with self._outage.trying():
+                self._disk.run(generations.close)
         self._disk.close(DEADLINE_S)
 
     @property

@@ -7,6 +7,7 @@ import json
 import logging
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,20 @@ def test_closed_checkpoint_has_two_copies(tmp_path: Path) -> None:
     kept.close()
     kept.close()
     assert (path.read_bytes().splitlines()[-1], previous_generation(path).read_bytes()) == (b"49", b"49\n")
+
+
+def test_closed_memory_leaves_no_thread_and_can_be_saved_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("afspm.storage.memory.DEADLINE_S", 60.0)  # a busy computer is no disk that hangs
+    before = {*threading.enumerate()}
+    path = tmp_path / "state.json"
+    memory = Memory(path, synced=False)
+    for count in range(2):
+        memory["count"] = count
+        assert memory.save()
+        memory.close()
+        # the syncer is one for the process, and closes nothing
+        assert not {one.name for one in {*threading.enumerate()} - before} - {"syncer"}
+        assert json.loads(previous_generation(path).read_bytes()) == {"count": count}
 
 
 def test_long_checkpoint_file_is_replaced(tmp_path: Path) -> None:
