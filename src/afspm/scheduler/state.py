@@ -31,6 +31,8 @@ from afspm.scheduler.safety.watchdog import Watchdog
 from afspm.scheduler.saved_state import SavedState
 from afspm.scheduler.settings import SchedulerSettings
 
+_WORD_S = 60.0  # from a person's word about the tip until the same person lets the run continue: one command says both
+
 
 @dataclass(frozen=True)
 class Peers:
@@ -204,9 +206,9 @@ class StateDraft(StateParts):
 
     def others_may_have_acted(self, *, unseen: bool = False, by: str = "") -> None:
         """Forget where the tip and its motor are. The arguments are those of `MoverState.unknown`."""
-        shown = self.panel.tip.engaged
-        change = partial(MoverState.unknown, at_sample=shown is True, unseen=unseen, by=by)
-        self.limits = self.limits.with_movers(change)
+        shown, said_s = self.panel.tip.engaged, self.limits.state.movers.cleared_s
+        by = by if self.now_s - said_s < _WORD_S else ""
+        self.limits = self.limits.with_movers(partial(MoverState.unknown, engaged=shown, unseen=unseen, by=by))
         if shown is not False:
             self.microscope = self.microscope.with_tip(away=False)
         self.instruments = self.instruments.changed(self.now_s)

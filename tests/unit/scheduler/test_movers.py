@@ -262,6 +262,9 @@ def test_steps_away_end_where_others_may_have_used_the_motor(
 
 def test_tip_is_read_twice_after_others_may_have_moved_it(motor: Motor) -> None:
     motor.lab.publish("TipStatus", TipStatus(engaged=True))
+    assert motor.refusal(names.START_SCAN).again_ns is not None, "shown there for the first time"
+    motor.lab.later(experiment_s=1.0)
+    motor.does(names.START_SCAN)
     pauses(motor)
     motor.does(names.START_SCAN)  # a tip that was away in between would have been seen
     loses_contact(motor)
@@ -295,7 +298,13 @@ def test_word_of_a_person_stands_for_the_steps_until_the_next_approach(motor: Mo
     assert "0 of 40" in motor.refusal(RIGHT).reason
     motor.lab.mode("page", ControlMode.MANUAL)
     assert motor.lab.says("page", ACTION, names.TIP_IS_CLEAR) == ControlResponse.SUCCESS
-    motor.lab.mode("quiet", ControlMode.AUTOMATED)  # the next morning, by another
+    motor.lab.later(real_s=61.0)
+    motor.lab.mode("page", ControlMode.AUTOMATED)  # much later
+    motor.lab.take_control("experiment")
+    assert "0 of 40" in motor.refusal(RIGHT).reason
+    motor.lab.mode("page", ControlMode.MANUAL)
+    assert motor.lab.says("page", ACTION, names.TIP_IS_CLEAR) == ControlResponse.SUCCESS
+    motor.lab.mode("quiet", ControlMode.AUTOMATED)  # by another
     motor.lab.take_control("experiment")
     assert "0 of 40" in motor.refusal(RIGHT).reason
     motor.lands()

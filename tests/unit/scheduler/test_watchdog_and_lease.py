@@ -157,8 +157,10 @@ def test_scan_of_a_dead_holder_is_only_stopped_with_the_feedback_on() -> None:
 
 def test_a_microscope_that_can_not_retract_is_not_asked_to() -> None:
     dog = watchdog(ScopeState.COARSE_MOTOR)
-    dog.tell("without_retract")
+    dog.watchdog = dog.watchdog.with_retract(is_supported=False)
     assert dog.control_taken(Cause.DEAD, None) == []
+    dog.watchdog = dog.watchdog.with_retract(is_supported=True)  # by the translator that was started next
+    assert dog.control_taken(Cause.DEAD, None) == ["x-retract"]
     assert watchdog(ScopeState.COARSE_MOTOR, retract=None).control_taken(Cause.DEAD, None) == []
 
 

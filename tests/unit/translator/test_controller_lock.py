@@ -110,9 +110,12 @@ def test_one_controller_of_this_computer_is_known_by_its_own_words_at_all_its_po
         take("session folder D:")  # once more after a lost connection
         with commanding("localhost:6503,6504", "b") as take_other:
             take_other("")
-            take_other("session folder E:")
             with pytest.raises(ControllerTaken, match="runs/first, process"):
                 take_other("session folder D:")
+            take_other("session folder E:")
+            take_other("session folder D:")  # chosen by a person meanwhile: a lost controller is reached again
+        with commanding("", "a shadow") as take_nothing:
+            take_nothing("session folder D:")
     with commanding("shm", "a") as take:
         take("session folder D:")
 

@@ -305,7 +305,7 @@ def test_tip_away_is_brought_back_by_the_feedback_after_a_lost_controller(
     held: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     at_offset(held, 500e-12)
-    ramp = []
+    ramp = list[float]()
     monkeypatch.setattr(held.translator.driver, "move_z", ramp.append)
     held.translator._connection.lose(ConnectionError("unplugged"))
     held.look(2.0)

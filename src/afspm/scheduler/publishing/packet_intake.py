@@ -92,7 +92,7 @@ def _update_state(draft: StateDraft, published: object) -> None:
         if draft.microscope.risk != before.risk:
             safety_commands.send(draft)
     elif isinstance(published, TipStatus):
-        is_back = published.engaged is True and draft.panel.tip.engaged is False
+        is_back = published.engaged is True and draft.panel.tip.engaged is not True
         draft.panel = replace(draft.panel, tip=published)
         if published.engaged:
             draft.microscope = draft.microscope.with_tip(away=False)

@@ -110,7 +110,7 @@ def _take_word(draft: StateDraft, event: RequestIn) -> None:
         why = "the tip is not shown as withdrawn: withdraw it, and move it away"
         answers.answer(draft, event, ControlResponse.ACTION_ERROR, why)
         return
-    draft.limits = draft.limits.with_movers(lambda state: replace(state, cleared_by=event.name))
+    draft.limits = draft.limits.with_movers(lambda state: replace(state, cleared_by=event.name, cleared_s=draft.now_s))
     draft.log("WARNING", f"{event.name} says that the tip is far enough from the sample for lateral moves")
     answers.answer(draft, event, ControlResponse.SUCCESS)
 

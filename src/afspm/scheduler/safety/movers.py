@@ -86,6 +86,7 @@ class MoverState:
         retracted: steps away that were made since the tip was last at the sample.
         is_unknown: whether others may have used the motor since the tip was last seen at the sample.
         cleared_by: the client through which a person has stated that the tip is far enough for a lateral move.
+        cleared_s: the real monotonic time of that statement.
         is_unproved: whether the tip was not proved at the sample since a move, an approach by the motor, or the begin.
         needs_approach: whether something was moved, and no approach has begun since.
         at_sample_ns: the experiment time of the first of the readings that show the tip at the sample.
@@ -97,6 +98,7 @@ class MoverState:
     retracted: int = 0
     is_unknown: bool = False
     cleared_by: str = ""
+    cleared_s: float = 0.0
     is_unproved: bool = False
     needs_approach: bool = False
     at_sample_ns: int | None = None
@@ -151,17 +153,17 @@ class MoverState:
         """Forget how far the tip was: it comes to the sample, is there, or moves as nothing here knows."""
         return replace(self, pending={}, answered=0, retracted=0, is_unknown=False, cleared_by="")
 
-    def unknown(self, *, at_sample: bool, unseen: bool, by: str = "") -> MoverState:
+    def unknown(self, *, engaged: bool | None, unseen: bool, by: str = "") -> MoverState:
         """Forget the steps away, and the proof if the tip may have been away: others may have used the motor.
 
         Args:
-            at_sample: whether the tip was last shown there; otherwise it is unproved anyway once it is back.
+            engaged: whether the tip was last shown at the sample; shown away, it is unproved anyway once it is back.
             unseen: whether the tip may have left the sample and come back without a reading in between.
             by: who ends MANUAL; a word of the same client counts for what follows.
         """
         word = self.cleared_by if self.cleared_by == by else ""
-        state = replace(self.near(), is_unknown=not at_sample, cleared_by=word, at_sample_ns=None)
-        return replace(state, is_unproved=self.is_unproved or (at_sample and unseen))
+        state = replace(self.near(), is_unknown=engaged is not True, cleared_by=word, at_sample_ns=None)
+        return replace(state, is_unproved=self.is_unproved or (engaged is not False and unseen))
 
     def withdrawn(self) -> MoverState:
         """Forget the steps away, since a withdrawal may end them."""
