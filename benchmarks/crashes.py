@@ -27,6 +27,7 @@ class CrashWatch:
         return [
             line
             for file in folder.rglob("log.txt")
+            if file.is_file()
             for line in file.read_text(encoding="utf-8", errors="replace").splitlines()
             if re.search(self._pattern, line)
         ]
