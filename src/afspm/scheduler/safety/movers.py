@@ -11,8 +11,8 @@ outcome, a move counts as made, and steps away do not.
 
 No controller shows its motor. So steps away and a person's word end wherever others may have used it
 (`MoverState.unknown`): with MANUAL (its begin and its end), an act by hand, a lost contact, and a restart of translator
-or scheduler; the last three end the proof, too. The ways, and the approach that is needed, stay; a way then means "at
-least".
+or scheduler. A lost contact and a restart, in which nothing is read, end the proof, too. The ways, and the approach
+that is needed, stay; a way then means "at least".
 """
 
 from __future__ import annotations
