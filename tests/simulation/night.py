@@ -208,7 +208,7 @@ def bad_night(seed: int) -> Plan:
 
 
 FINDERS = [
-    *map(bad_night, (9, 14, 11, 5, 13, 6, 0, 3)),
+    *map(bad_night, (9, 14, 11, 5, 13, 6, 0, 3, 58)),
     *(
         Plan(5, 2.0, cast=("experiment", "person", "careless"), lease_s=None, ends=True, faults=faults)
         # they end while the tip is in danger, the first while the translator does not answer
@@ -238,7 +238,7 @@ def panel_night(seed: int) -> Plan:
     return replace(plan(seed, hours=4.0), panel=maker, acts=(2.0, 10.0)[seed % 2], repeats=repeats)
 
 
-PANEL_NIGHTS = [*_PANEL_NIGHTS, panel_night(91), panel_night(140)]
+PANEL_NIGHTS = [*_PANEL_NIGHTS, panel_night(199), panel_night(449)]
 """One night for each maker, with a person at its panel; in two more the scheduler's own actions wait meanwhile."""
 
 

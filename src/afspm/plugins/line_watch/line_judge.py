@@ -101,7 +101,7 @@ class JudgeSettings:
     elsewhere: float = 0.25
     # rows of a cell, its width relative to the line, and the share of the cells that new adatoms may fill
     cell: tuple[int, float, float] = (4, 1 / 16, 0.4)
-    alike: float = 0.5  # correlation of the differences with the steepness of the sample, above which a tip made them
+    alike: float = 0.4  # correlation of the differences with the steepness of the sample, above which a tip made them
     alike_px: int = 16  # farthest shift of a ghost for that
     unexplained: float = 0.4  # share of the threshold that another cause than the tip may leave
     # share of the sum that another cause may leave, if that is more than `unexplained`; each of 9 changed tips left a
