@@ -109,6 +109,13 @@ def test_scan_is_stopped_before_z_is_released(held: Lab) -> None:
     assert sent(held)[3:] == []
 
 
+def test_refused_release_is_sent_again_once_the_microscope_is_free(held: Lab) -> None:
+    dies(held)
+    held.answer(held.forwarded[-1], ControlResponse.NOT_FREE)
+    held.scope_is(ScopeState.FREE)
+    assert sent(held) == [names.RELEASE_Z, names.RELEASE_Z]
+
+
 # tip T9
 def test_scan_in_a_hold_is_stopped_before_its_release_also_if_its_holder_gives_control_back(held: Lab) -> None:
     held.scope_is(ScopeState.SCANNING)

@@ -127,6 +127,47 @@ def test_moves_are_ramps_at_the_speed(held: Any) -> None:
     assert heights[-1] == pytest.approx(100e-12, abs=1e-15)
 
 
+def test_late_step_of_a_ramp_is_no_longer_than_any_other(held: Any) -> None:
+    assert act(held, names.HOLD_Z).ok
+    z_m = number(held, names.TIP_Z)
+    assert put(held, names.HELD_Z_OFFSET, -100e-12).ok
+    held.look(60.0)
+    assert number(held, names.TIP_Z) - z_m == pytest.approx(-10e-12, abs=1e-13)
+
+
+def test_z_that_does_not_follow_ends_the_hold(held: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert act(held, names.HOLD_Z).ok
+    monkeypatch.setattr(held.translator.driver, "move_z", lambda z_m: None)
+    assert put(held, names.HELD_Z_OFFSET, -100e-12).ok
+    until_free(held)
+    assert get(held, names.Z_IS_HELD) == "false"
+    assert "and reads" in act(held, names.RELEASE_Z).reason
+
+
+def test_controller_that_lifts_the_tip_as_the_feedback_goes_off_holds_nothing(
+    held: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    driver: Driver = held.translator.driver
+    plain, z_m = driver.set, number(held, names.TIP_Z)
+
+    def lifts(values: dict[str, Any]) -> None:
+        plain(values)
+        if values.get(names.FEEDBACK_ON) is False:
+            driver.move_z(z_m + 100e-12)
+
+    monkeypatch.setattr(driver, "set", lifts)
+    assert "switch a tip lift of the controller off" in act(held, names.HOLD_Z).reason
+    until_free(held)
+    assert get(held, names.FEEDBACK_ON) == "true"
+
+
+def test_running_scan_is_stopped_before_a_release(held: Any) -> None:
+    at_offset(held, -50e-12)
+    assert act(held, names.START_SCAN).ok
+    assert act(held, names.RELEASE_Z).code == ControlResponse.NOT_FREE
+    assert get(held, names.Z_IS_HELD) == "true"
+
+
 @pytest.mark.parametrize(("bound", "bias_v"), [("1e-10", 0.01), ("5e-11", 0.01), ("1e-10", -0.01)])
 def test_current_beyond_the_bound_ends_the_hold_with_the_reason(held: Any, bound: str, bias_v: float) -> None:
     assert put(held, names.HELD_Z_ABORT_CURRENT, bound).ok
