@@ -149,7 +149,7 @@ class Forwarder:
     timeout_s: float = 5.0
     patience_s: float = 5.0
     longest_queue: int = 64
-    most_of_client: int = 8
+    most_of_client: int = 32
     flooders: tuple[str, ...] = ()
     up: bool = False
     number: int = 0
