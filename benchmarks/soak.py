@@ -105,7 +105,8 @@ class Soak:
         self._noise.setsockopt(zmq.SNDHWM, 0)
         noise = f"tcp://127.0.0.1:{self._noise.bind_to_random_port('tcp://127.0.0.1')}"
         # a shorter journal than the usual one of a thousand packets: it is full in the first tenth
-        self._scheduler_publish, self._scheduler = processes.scheduler(noise, serve, cache={"history": {"JournalEntries": 50}})
+        cache = {"history": {"JournalEntries": 50}}
+        self._scheduler_publish, self._scheduler = processes.scheduler(noise, serve, cache=cache)
         self._translator = serve
         self._heard = processes.start("soaked_component", source=self._scheduler_publish, noise=noise)
         self._friend = ZmqPort(

@@ -18,6 +18,7 @@ from tests.plugins.test_makers import MAKERS, Maker
 from tests.plugins.vendor_bench import PATIENT, SOON, Peer, VendorBench, scans, states
 from tests.plugins.wire_tap import lua_scripts, nanonis_names, tapped, zmtp_objects
 
+from afspm.driver import contact
 from afspm.emulation import ScanActivity
 from afspm.model import ActByHand, ControlResponse, PanelAct, ScopeState, names
 
@@ -188,6 +189,25 @@ def test_shadow_sends_questions_only_over_a_night_of_a_person(
     made.let_go()
     sent = night.sent()
     assert len(sent) > 50
+    assert unasked_for(watched, sent) == []
+
+
+@each
+def test_contact_reads_what_is_in_force_and_sends_questions_only(watched: Watched, beside: Make) -> None:
+    night = beside(shadow_of(watched))
+    found = contact(resolve_name(shadow_of(watched))(address=night.address, **night.settings))
+    assert found.lost is None
+    assert found.status is not None
+    assert found.status.state is FREE
+    bias = found.answers.get(names.TIP_BIAS_VOLTAGE)
+    assert (bias is None) == (watched.name == "nanosurf")  # Studio has none without a second device
+    assert bias is None or bias.value == pytest.approx(night.made.emulator.rig.setup.bias_v)
+    assert found.answers[names.ZCTRL_SETPOINT].value
+    assert {"x", "y"} <= {name[-1] for name in found.reach}
+    unread = [name for name, one in found.answers.items() if one.value is None and one.was_asked]
+    assert unread == []
+    sent = night.sent()
+    assert len(sent) > 5
     assert unasked_for(watched, sent) == []
 
 

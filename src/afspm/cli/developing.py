@@ -328,6 +328,38 @@ def driver(name: Name, into: Into = Path()) -> None:
     _write("driver", name, into, what, "afspm test-translator experiment.toml")
 
 
+@new_app.command("instrument")
+def instrument(
+    maker: Annotated[str, typer.Argument(metavar="MAKER", help="Of the controller, e.g. nanonis.")],
+    address: Annotated[str, typer.Argument(metavar="[ADDRESS]", help="By default the maker's usual one.")] = "",
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="The file to write.")] = Path(
+        "instrument.toml"
+    ),
+) -> None:
+    """Ask a controller, and write a file for it: address, roles of channels, and proposed limits with their reasons.
+
+    Only questions are sent. Lay the file over any experiment: `afspm run drift_night/experiment.toml instrument.toml`.
+    """
+    import datetime as dt
+
+    from afspm.basics.errors import ConfigError
+    from afspm.cli import contacting, examination, instrument_file
+
+    if out.exists():
+        raise ConfigError("the file is there already", where=str(out), hint="name another with --out")
+    driver = contacting.driver_of(maker)
+    settings = {"address": address} if address else {}
+    at, found, why_not = contacting.asked(driver, settings)
+    told = [*why_not, *(contacting.told(found, at) if found is not None else ())]
+    examination.show(told)
+    if found is None or found.lost is not None:
+        raise typer.Exit(1)
+    day = dt.datetime.now(dt.UTC).date().isoformat()
+    text = instrument_file.text_of(driver.__name__, {"address": at}, driver.channels_of(settings), found, day)
+    out.write_text(text, encoding="utf-8")
+    typer.echo(f"{out}: look through its limits; then try it with: afspm check EXPERIMENT.toml {out}")
+
+
 def _write(kind: str, name: str, into: Path, what: str, command: str) -> None:
     from afspm.testing.skeletons import write
 

@@ -12,6 +12,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import psutil
+from rich.console import Console
+from rich.text import Text
 
 from afspm import wire
 from afspm.basics import entry_points
@@ -21,6 +23,7 @@ from afspm.basics.errors import AfspmError
 from afspm.basics.formatting import duration_text
 from afspm.basics.launch import Launch, Sockets
 from afspm.basics.plain_data import Plain
+from afspm.cli import contacting
 from afspm.client.component import Component
 from afspm.client.connect import find_run, guest_of
 from afspm.experiment import Experiment, Role
@@ -28,6 +31,7 @@ from afspm.model import CLOCK_REQUEST, ProcessCondition, ProcessStates, Request
 from afspm.model.events import SUPERVISOR
 from afspm.record import goes_on
 from afspm.supervisor.reporter import computer_name
+from afspm.translator.driver_base import DriverBase
 from afspm.translator.trace import FILE as TRACE_FILE
 from afspm.translator.trace import load_of, newest_lines
 from afspm.transport import diagnosis, keys, probe
@@ -37,6 +41,7 @@ from afspm.transport.port import CaughtUp, ControlConnected, PacketReceived, Rep
 from afspm.transport.zmq_port import open_port
 from afspm.wire.message_types import register_all
 
+_COLOURS = {"fine": "green", "warning": "yellow", "error": "bold red"}
 _PROBE_BYTES = 16 << 20  # written once to measure the disk
 # keys that are usually on any computer of an experiment; else any key found there is used
 _ASKED_AS = (SUPERVISOR, "terminal")
@@ -56,17 +61,27 @@ class Examination:
         return diagnosis.is_well(self.found)
 
 
-def examine(experiment: Experiment | None, runs: Path, listen_s: float, commands: Collection[str] = ()) -> Examination:
+def examine(
+    experiment: Experiment | None,
+    runs: Path,
+    listen_s: float,
+    commands: Collection[str] = (),
+    *,
+    everything: bool = False,
+) -> Examination:
     """Examine an experiment from this computer, and count its scheduler's packets for `listen_s` of real time.
 
-    Without an experiment, or with errors in its file, only this computer is examined.
+    A real controller is asked what is in force there. Without an experiment, or with errors in its file, only this
+    computer is examined.
 
     Args:
         commands: names of afspm's own commands, which no package can replace.
+        everything: whether to list all parameters of the controller.
     """
     examination = Examination([] if experiment is None else [*_file(experiment)])
     examination.found += diagnosis.of_packages(entry_points.inventory(commands))
     if experiment is not None and diagnosis.is_well(examination.found):
+        examination.found += controller(*experiment.resolved.driver(), everything=everything)
         examination.found += _keys(experiment)
         _Connections(experiment, examination).examine(listen_s)
         examination.found += _devices(experiment)
@@ -74,6 +89,23 @@ def examine(experiment: Experiment | None, runs: Path, listen_s: float, commands
     examination.found += _disk(runs)
     examination.found.append(diagnosis.of_memory(psutil.virtual_memory().available, _sizes(examination.pids)))
     return examination
+
+
+def show(found: Collection[Diagnosis], *, everything: bool = True) -> None:
+    """Print diagnoses, the faults last, where one looks.
+
+    Args:
+        everything: whether to print what the packages offer, which tells nothing of an experiment.
+    """
+    console = Console(highlight=False)
+    for one in sorted(found, key=lambda one: list(Severity).index(one.severity)):
+        if (one.code, one.severity) == ("package", Severity.FINE) and not everything:
+            continue
+        word = one.severity.value
+        line = Text.assemble((f"{word:8}", _COLOURS[word]), (one.where, "bold"), f": {one.what}")
+        if one.remedy:
+            line.append(f"\n        {one.remedy}", "dim")
+        console.print(line, soft_wrap=True)
 
 
 def _file(experiment: Experiment) -> Iterator[Diagnosis]:
@@ -89,6 +121,16 @@ def _file(experiment: Experiment) -> Iterator[Diagnosis]:
             for lost in experiment.resolved.lost_without():
                 what, _, hint = lost.partition("; ")
                 yield Diagnosis("withdrawal", Severity.WARNING, translator.name, what, hint)
+
+
+def controller(
+    kind: type[DriverBase] | None, settings: Mapping[str, object], *, everything: bool = False
+) -> list[Diagnosis]:
+    """Return what a controller tells; nothing without a driver."""
+    if kind is None:
+        return []
+    at, contact, why_not = contacting.asked(kind, settings)
+    return [*why_not, *(contacting.told(contact, at, everything=everything) if contact is not None else ())]
 
 
 def _keys(experiment: Experiment) -> Iterator[Diagnosis]:

@@ -296,31 +296,40 @@ def work_text(work: PlannedWork) -> str:
     return bound + ", ".join(parts) + (f" ({work.why})" if work.why else "")
 
 
-_COLOURS = {"fine": "green", "warning": "yellow", "error": "bold red"}
-
-
 def doctor(
     context: typer.Context,
     files: OptionalFiles = None,
     runs: Runs = RUNS,
     listen: Annotated[float, opt("Seconds to listen to published packets.", "--listen", min=0.1)] = 3.0,
+    on: Annotated[str, opt("Only ask the controller of this maker, e.g. nanonis.", "--on", metavar="MAKER")] = "",
+    at: Annotated[str, opt("Its address; without it, the maker's usual one.", "--at", metavar="ADDRESS")] = "",
+    everything: Annotated[bool, opt("List all parameters, and what all packages add to afspm.", "--all")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> None:
     """Find the faults of an experiment, seen from this computer, with remedies.
 
-    Checks names, ports, keys, clocks, versions, disk and memory, and the packets of the scheduler. Works before the
-    experiment runs, while it runs, and when a part of it does not. Lists the drivers, components, readers … of all
-    installed packages, and the reasons why some can't be loaded. Without a file only this computer is checked. Ends
-    with 1 if something keeps the experiment from working.
+    A real controller is asked what is in force: its release, range, preamplifier, bias, setpoint … Questions are all
+    that is sent to it. Checks names, ports, keys, clocks, versions, disk and memory, and the packets of the scheduler.
+    Works before the experiment runs, while it runs, and when a part of it does not. Tells why a driver, component,
+    reader … of an installed package can't be loaded. Without a file only this computer is checked. Ends with 1 if
+    something keeps the experiment from working.
     """
-    from afspm.cli.examination import examine
+    from afspm.cli import examination
+    from afspm.cli.contacting import driver_of
     from afspm.experiment import load
 
-    examined = examine(load(*files) if files else None, runs, listen, _commands(context))
+    if (at and not on) or (on and files):
+        raise typer.BadParameter("name a file, or a maker with --on and perhaps --at", param_hint="--on")
+    if on:
+        settings = {"address": at} if at else {}
+        examined = examination.Examination(examination.controller(driver_of(on), settings, everything=everything))
+    else:
+        experiment = load(*files) if files else None
+        examined = examination.examine(experiment, runs, listen, _commands(context), everything=everything)
     if as_json:
         typer.echo(json.dumps(_as_json(examined), indent=2, ensure_ascii=False))
     else:
-        _show(examined)
+        _show(examined, everything=everything)
     if not examined.is_well:
         raise typer.Exit(1)
 
@@ -336,18 +345,10 @@ def _as_json(examined: Examination) -> dict[str, object]:
     return {"is_well": examined.is_well, "found": found, "heard": heard}
 
 
-def _show(examined: Examination) -> None:
-    from rich.console import Console
-    from rich.text import Text
+def _show(examined: Examination, *, everything: bool) -> None:
+    from afspm.cli.examination import show
 
-    console = Console(highlight=False)
-    # the lists of what the packages offer come last: they tell nothing of this experiment
-    for one in sorted(examined.found, key=lambda one: (one.code, one.severity.value) == ("package", "fine")):
-        word = one.severity.value
-        line = Text.assemble((f"{word:8}", _COLOURS[word]), (one.where, "bold"), f": {one.what}")
-        if one.remedy:
-            line.append(f"\n        {one.remedy}", "dim")
-        console.print(line, soft_wrap=True)
     for heard in examined.heard:
         told = f"packets {heard.envelope}: {heard.rate_hz:.2g} a second, {heard.bytes_per_s / 1000:.3g} kB/s"
-        console.print(Text(told), soft_wrap=True)
+        typer.echo(told)
+    show(examined.found, everything=everything)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Protocol
 
@@ -11,6 +11,7 @@ import typer
 from afspm.basics import entry_points
 from afspm.basics.errors import ConfigError
 from afspm.cli.arguments import RUNS, Files, OptionalFiles, Runs, Speed, names_in, opt
+from afspm.model import Role
 
 if TYPE_CHECKING:
     from afspm.basics.plain_data import PlainMapping
@@ -129,11 +130,39 @@ def run(
         for start in running.dry_run(experiment, options):
             typer.echo(_described(start))
         return
+    _require_limits(experiment, options.only, options.without)
     if ask:
         options = replace(options, metadata=ask_metadata(experiment))
     ended = running.run(experiment, options, terminal=sys.stdout)
     _keep_page(experiment, ended, stay)
     raise typer.Exit(ended.outcome.exit_code)
+
+
+def _require_limits(experiment: Experiment, only: Collection[str], without: Collection[str]) -> None:
+    # at a real controller a person has said what is allowed, or says that nothing is forbidden
+    import sys
+
+    from afspm.cli import contacting
+    from afspm.experiment.process_starts import chosen_names
+
+    resolved = experiment.resolved
+    kind, settings = resolved.driver()
+    given = dict(resolved.document.data.get("limits", {}))
+    is_said = given.pop("none", False) or given or resolved.default_limits.sources()
+    chosen = chosen_names(resolved, only, without)
+    is_here = any(translator.name in chosen for translator in resolved.with_role(Role.TRANSLATOR))
+    if kind is None or is_said or not is_here or experiment.simulated(only, without):
+        return
+    if not sys.stdin.isatty():
+        what = "no limits are set for a real controller"
+        hint = "`afspm new instrument` proposes some; or say that you want none: [limits] none = true"
+        raise ConfigError(what, where=str(experiment.files[0]), hint=hint)
+    at, found, _ = contacting.asked(kind, settings)
+    if found is not None:
+        for line in contacting.told(found, at):
+            if line.code == "reading":
+                typer.echo(f"{line.where}: {line.what}")
+    typer.confirm("No limits are set ([limits]): nothing that a component asks for is refused. Run?", abort=True)
 
 
 def _keep_page(experiment: Experiment, ended: FinishedRun, wanted: bool | None) -> None:

@@ -50,6 +50,9 @@ if TYPE_CHECKING:
     from afspm.translator.tcp import Receiver, TcpConnection, host_and_port
     from afspm.translator.zmq_connection import ZmqConnection
 
+if TYPE_CHECKING:  # for the tests of a shadow
+    from afspm.translator.contact import contact
+
 if TYPE_CHECKING:  # one maker's controller has it today, and another's may
     from afspm.storage.formats import igor, netcdf
     from afspm.storage.formats.content import clock_ns
@@ -107,6 +110,7 @@ __all__ = [
     "check_speed",
     "clock_ns",
     "connected",
+    "contact",
     "encode_scan",
     "encode_spectrum",
     "frame",
@@ -138,6 +142,7 @@ if not TYPE_CHECKING:
             "afspm.storage.formats": "hdf5_reading igor netcdf",
             "afspm.storage.formats.content": "FileContent OtherFormat local_ns name_and_unit text_of clock_ns",
             "afspm.translator.activity": "Activity TipWay",
+            "afspm.translator.contact": "contact",
             "afspm.translator.driver": "Driver",
             "afspm.translator.driver_base": "ControllerLost action connected "
             "LOST CoarseMove ControllerSilent Introduction",

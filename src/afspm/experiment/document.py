@@ -56,8 +56,14 @@ class Document:
         return list(self.homes or dict.fromkeys(file.resolve().parent for file in self.files))
 
 
+REPLACES = "replaces"
+"""A key of any table of a further file."""
+
+
 def read(files: Sequence[Path], homes: Sequence[Path] = ()) -> Document:
     """Read the files and merge them in order: tables key by key; for any other value the last file wins.
+
+    A table with `replaces = true` is not merged: it stands in place of the one before.
 
     A file that can't be read or parsed is reported in the findings, and left out.
     """
@@ -143,9 +149,19 @@ def _merge(
 ) -> None:
     for key, value in above.items():
         here = (*path, key)
-        if isinstance(value, dict) and isinstance(below.get(key), dict):
-            _merge(below[key], value, here, places)
+        if not isinstance(value, dict):
+            below_it = None
+        elif value.get(REPLACES) is True:
+            below_it, value = None, {name: one for name, one in value.items() if name != REPLACES}
+        else:
+            below_it = below.get(key)
+        if isinstance(below_it, dict):
+            _merge(below_it, value, here, places)
             continue
         for old in [p for p in places if p[: len(here)] == here]:
             del places[old]  # the value there is replaced as a whole
-        below[key] = copy.deepcopy(value)
+        if isinstance(value, dict):
+            below[key] = {}
+            _merge(below[key], value, here, places)
+        else:
+            below[key] = copy.deepcopy(value)

@@ -83,11 +83,12 @@ class RegionSection(Section):
 
 
 class LimitsSection(Section):
-    """Keys of [limits] that are not parameters: the bounds of `ExperimentLimits`, and loosened defaults."""
+    """Keys of [limits] that are not parameters: the bounds of `ExperimentLimits`, loosened defaults, or none."""
 
     region: RegionSection | None = None
     most_pixels: Count = ExperimentLimits.most_pixels
     loosen: tuple[str, ...] = ()
+    none: bool = False
 
 
 class RoleSection(Section):

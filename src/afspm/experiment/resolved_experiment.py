@@ -128,16 +128,16 @@ class ResolvedExperiment:
 
     def never_shown(self) -> dict[str, str]:
         """Return what the controller never shows of a measurement, with the reasons; empty if it is simulated."""
-        kind, settings = self._driver()
+        kind, settings = self.driver()
         return kind.without_witness(settings) if kind is not None else {}
 
     def lost_without(self) -> Sequence[str]:
         """Return what a real controller with these settings can't do, each with its remedy, as sentences."""
-        kind, settings = self._driver()
+        kind, settings = self.driver()
         return kind.lost_without(settings) if kind is not None and not self.emulators else ()
 
-    def _driver(self) -> tuple[type[Driver] | None, Mapping[str, object]]:
-        # the class of the microscope with its settings; None for a simulated one, and one in another language
+    def driver(self) -> tuple[type[Driver] | None, Mapping[str, object]]:
+        """Return the class of a microscope with its settings; None for a simulated one, or in another language."""
         from afspm.translator.driver import Driver
 
         for translator in self.with_role(Role.TRANSLATOR)[:1]:

@@ -46,9 +46,17 @@ class ShadowDriver(DriverBase):
         raise refusal(", ".join(values))
 
 
+_NOT_SENT = "not sent, since a shadow only reads the controller"
+
+
+def is_refusal(text: str) -> bool:
+    """Return whether a reason is that of `refusal`."""
+    return text.endswith(_NOT_SENT)
+
+
 def refusal(what: str) -> Refused:
     """Return the refusal of everything that is no question."""
-    reason = f"{what}: not sent, since a shadow only reads the controller"
+    reason = f"{what}: {_NOT_SENT}"
     return Refused(ControlResponse.ACTION_NOT_SUPPORTED, reason)
 
 

@@ -23,6 +23,9 @@ address = "{}"
 [scheduler]
 component = true
 class = "Scheduler"
+
+[limits]
+none = true
 """
 
 

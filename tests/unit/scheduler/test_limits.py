@@ -505,6 +505,11 @@ def test_request_depends_on_values_with_a_limited_step_or_rate() -> None:
     assert depends(g, set_("1e-6", "m/s", "scan-speed")) == set()
 
 
+def test_place_is_read_as_a_whole_where_one_of_its_values_is_limited() -> None:
+    g = checker(ExperimentLimits({"probe-pos-x": Limit(step=1e-6)}))
+    assert depends(g, set_("1", "um", "probe-pos-x")) == {"probe-pos-x", "probe-pos-y"}
+
+
 def test_part_of_a_place_and_action_there_depend_on_the_place() -> None:
     g = checker(ExperimentLimits(region=STAGE))
     assert depends(g, set_("1", "um", "scan-size-x")) == depends(g, scan(RegionChange(left_m=0.0))) == FRAME

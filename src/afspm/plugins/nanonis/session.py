@@ -29,7 +29,8 @@ _WITHDRAWS_WITHIN_S: Final = 2.0
 """Longest wait for an answer of the port that is kept for withdrawing, real time."""
 _HINTS: Final = (
     "is Nanonis running, with this port open (File > Settings Options > TCP Programming Interface)?",
-    "Nanonis is silent while a dialog waits for an answer on its screen",
+    "Nanonis is silent while a dialog waits for an answer on its screen; or another client has this port, which serves "
+    "one, or another program listens there",
 )
 
 

@@ -18,6 +18,7 @@ QUESTIONS: Final = frozenset({
     *("ZCtrl.CtrlListGet", "Current.Get", "Current.GainsGet", "Piezo.TiltGet", "Piezo.DriftCompGet"),
     *("Piezo.RangeGet", "Piezo.CalibrGet", "Piezo.XYZLimitsGet"),
     *("BiasSpectr.StatusGet", "ZSpectr.StatusGet", "AutoApproach.OnOffGet"),
+    *("SafeTip.OnOffGet", "SafeTip.PropsGet"),
 })  # fmt: skip
 """Functions of Nanonis that return a value and change nothing; `Scan.WaitEndOfScan` waits at most a second."""
 _AUTOSAVE, _OFF = 2, 2

@@ -1,0 +1,138 @@
+"""A first contact with a controller: who answers, and what is in force there, by questions alone.
+
+The driver is a maker's shadow (`translator.shadow`): it has no function that sets or starts anything, and its link
+sends nothing but questions.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import AfspmError, Refused
+from afspm.basics.plain_data import Plain
+from afspm.model import ScopeStatus, names
+from afspm.translator.driver_base import LOST, DriverBase
+from afspm.translator.parameters import ParameterSpec, Value
+from afspm.translator.shadow import is_refusal
+
+_FACTORS: Final = (5.0, 4.0, 3.0, 2.0, 1.5, 1.0)
+
+
+@dataclass(frozen=True)
+class ParameterReading:
+    """The answer to one question.
+
+    Attributes:
+        value: in the unit of `row`; None: there is none, see `fault`.
+        took_s: real time.
+        fault: why there is no value.
+    """
+
+    row: ParameterSpec
+    value: Value | None
+    took_s: float
+    fault: str = ""
+
+    @property
+    def was_asked(self) -> bool:
+        """False for a question that the shadow does not send."""
+        return not is_refusal(self.fault)
+
+
+@dataclass
+class Contact:
+    """What a controller has told of itself.
+
+    Attributes:
+        said: what the driver logged while it connected: the release, the preamplifier, what is missing; with levels.
+        connected_s: the real time until the driver was connected; None: it could not be, see `lost`.
+        lost: why the controller did not answer, or no longer.
+        status: its state; None: unknown.
+        answers: by the generic names of parameters.
+        reach: the range of the scanner, by the names of places.
+        results: names of finished measurements, oldest first, as far as the driver looks for them.
+        most_setpoint: the largest setpoint that the preamplifier reaches, if five times the one in force is beyond it.
+    """
+
+    said: list[tuple[int, str]] = field(default_factory=list)
+    connected_s: float | None = None
+    lost: Exception | None = None
+    identity: str = ""
+    status: ScopeStatus | None = None
+    answers: dict[str, ParameterReading] = field(default_factory=dict)
+    reach: Mapping[str, ParameterSpec] = field(default_factory=dict)
+    results: tuple[str, ...] = ()
+    most_setpoint: float | None = None
+
+
+class _Kept(logging.Handler):
+    def __init__(self, said: list[tuple[int, str]]) -> None:
+        super().__init__(logging.INFO)
+        self._said = said
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if (one := (record.levelno, record.getMessage())) not in self._said:
+            self._said.append(one)
+
+
+def contact(driver: DriverBase) -> Contact:
+    """Connect, ask for the state and all parameters, each alone, and close the connection.
+
+    Args:
+        driver: one that `only_reads`.
+    """
+    assert driver.only_reads
+    found, clock = Contact(), ExperimentClock.real()
+    log = logging.Logger("contact", logging.INFO)  # without parents: a person reads `said` alone
+    log.addHandler(_Kept(found.said))
+    memory: Plain = {}
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        driver.clock, driver.log, driver.run_dir, driver.memory = clock, log, Path(folder), memory
+        driver.wake = lambda: None
+        began_s = clock.monotonic_s()
+        try:
+            driver.connect()
+            found.connected_s = clock.monotonic_s() - began_s
+            found.identity, found.status = driver.identity, driver.status()
+            for name, row in driver.table.items():
+                found.answers[name] = _asked(driver, name, row, clock)
+            found.reach, found.results = dict(driver.reach()), tuple(driver.results())
+            found.most_setpoint = _most_setpoint(driver, found)
+        except (*LOST, AfspmError) as error:
+            found.lost = error
+        finally:
+            driver.close()
+    return found
+
+
+def _most_setpoint(driver: DriverBase, found: Contact) -> float | None:
+    # by asking whether a setpoint would be refused: the driver knows the preamplifier, and nothing is set
+    before = {name: one.value for name, one in found.answers.items() if one.value is not None}
+    value = before.get(names.ZCTRL_SETPOINT)
+    for factor in _FACTORS:
+        if not isinstance(value, float):
+            return None
+        try:
+            driver.refuse_unreachable({names.ZCTRL_SETPOINT: factor * value}, before)
+        except Refused:
+            continue
+        return None if factor == _FACTORS[0] else factor * value
+    return None
+
+
+def _asked(driver: DriverBase, name: str, row: ParameterSpec, clock: ExperimentClock) -> ParameterReading:
+    began_s = clock.monotonic_s()
+    try:
+        value: Value | None = driver.in_force([name])[name]
+        fault = ""
+    except LOST:
+        raise
+    except Exception as error:  # of a driver, which may raise anything: what can't be read is told
+        value, fault = None, str(error)
+    return ParameterReading(row, value, clock.monotonic_s() - began_s, fault)
