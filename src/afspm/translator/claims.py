@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
-from afspm.basics.errors import InvalidValue, Refused
 from afspm.model import ActByHand, MeasurementConditions, Parameter, Request, ScopeState, TipStatus, names
 from afspm.model.caption import BIAS_REFERENCE, captioned
 from afspm.translator.driver_base import DriverBase
@@ -165,11 +164,8 @@ class Claims:
         return captioned(self._driver.table, of_scan=of_scan)
 
     def _read_shown(self, wanted: Collection[str]) -> dict[str, Value]:
-        try:
-            return self._driver.in_force(list(wanted)) if wanted else {}
-        except (InvalidValue, Refused) as error:  # a caption is no reason to refuse or lose a measurement
-            self._driver.log.debug("the settings of a caption are left out: %s", error)
-            return {}
+        # a caption is no reason to refuse or lose a measurement
+        return self._driver.reported(list(wanted))
 
     def _read(self, wanted: Mapping[str, Value]) -> dict[str, Value]:
         return self._driver.in_force(list(wanted)) if wanted else {}

@@ -735,6 +735,15 @@ class DriverBase(ABC):
             for name in wanted
         }
 
+    def reported(self, wanted: Collection[str]) -> dict[str, Value]:
+        """Return the values of `in_force` that the controller reports, without the others."""
+        try:
+            return self.in_force(wanted)
+        except (InvalidValue, Refused) as error:
+            self.log.debug("%s can't be read: %s", ", ".join(wanted), error)
+        alone = [self.reported([name]) for name in wanted] if len(wanted) > 1 else []
+        return {name: value for values in alone for name, value in values.items()}
+
     def put_in_force(self, values: Mapping[str, Value]) -> None:
         """Write values and remember them for `in_force`.
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from afspm import wire
 from afspm.basics.clock import NS_PER_S
-from afspm.basics.errors import AfspmError
+from afspm.basics.errors import AfspmError, InvalidValue, Refused
 from afspm.basics.shared_time import Publication
 from afspm.model import (
     ActByHand,
@@ -43,6 +43,7 @@ from afspm.translator.wished_feedback import FeedbackLevel, WishedFeedback
 from afspm.transport.port import ServerPort
 
 _TIP = (names.ENGAGED, FEEDBACK_ON)
+_GAINS = (names.ZCTRL_PGAIN, names.ZCTRL_IGAIN)
 _AGAIN_S = 0.1
 """Real time until the feedback is read again, once it was found off though on is wished."""
 _SELDOM_S = 1.0
@@ -77,7 +78,7 @@ class Observer:
         self._outbox = Outbox(driver, state.kept["outbox"], state.stamp, log)
         self._polling = AdaptivePolling(driver.common.poll_period_s, driver.eager_poll_s)
         self._live = LiveLines(driver)
-        self._unreadable = ""
+        self._unreadable = self._refused = ""
         self.values: dict[str, Value] = {}
         self._told: dict[str, Value] = {}
         # of real time at least, for an emulated controller
@@ -518,7 +519,15 @@ class Observer:
         # a difference below the controller's resolution is no change
         table, old = self._driver.table, self.values
         extra = [name for name in EXTRA if name in table]
-        values = self._driver.in_force([*setting_groups.watched(table), *extra, *table.watched])
+        vital = [name for name in setting_groups.watched(table) if name not in _GAINS]
+        others = [*(name for name in _GAINS if name in table), *extra, *table.watched]
+        try:
+            values = self._driver.in_force([*vital, *others])
+        except (InvalidValue, Refused) as error:  # lost only if nothing can be measured without the value
+            if str(error) != self._refused:
+                self._refused = str(error)
+                self._log.warning("settings that are watched can't be read: %s", error)
+            values = self._driver.in_force(vital) | self._driver.reported(others)
         return {
             name: old[name] if name in old and table[name].same(old[name], value) else value
             for name, value in values.items()
