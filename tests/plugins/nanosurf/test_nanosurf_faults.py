@@ -8,7 +8,7 @@ import pytest
 from tests.plugins.nanosurf.nanosurf_bench import Bench
 from tests.plugins.vendor_bench import SOON, Peer, ready, scanned, scans, small, states
 
-from afspm.model import ScopeState, names
+from afspm.model import ControlResponse, ScopeState, names
 
 Make = Callable[..., Bench]
 FREE, UNDEFINED = ScopeState.FREE, ScopeState.UNDEFINED
@@ -27,7 +27,6 @@ def scans_again(peer: Peer) -> None:
         ("late-reply", "no answer to"),
         ("half-reply", "the connection was closed after"),
         ("garbage", "a reply that is not Lua"),
-        ("nan", "Studio replied"),
         ("error", "Studio's session is not what it was: an emulated error"),
     ],
 )
@@ -39,6 +38,17 @@ def test_bad_reply_is_logged_and_studio_reconnected(bench: Make, kind: str, logg
     peer.until(FREE)
     made.until_logged(logged)
     scans_again(peer)
+
+
+def test_value_that_is_no_number_is_logged_and_scans_go_on(bench: Make) -> None:
+    made = bench()
+    peer = small(made, **SOON)
+    made.strike("nan")
+    made.until_logged("Studio replied")
+    while not (response := peer.act(names.START_SCAN)).ok:  # the frame itself may have been no number
+        assert response.code in (ControlResponse.NOT_FREE, ControlResponse.NO_RESPONSE), response.reason
+    while not scans(peer.until(FREE)):
+        pass
 
 
 @pytest.mark.parametrize(("kind", "logged"), [("dialog", "a dialog may wait on its screen"), ("restart", "connection")])

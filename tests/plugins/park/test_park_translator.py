@@ -145,7 +145,6 @@ def test_refused_withdrawal_is_no_success(bench: Make, monkeypatch: pytest.Monke
         ("late-reply", "no reply to"),
         ("half-reply", "SmartScan's reply is not JSON"),
         ("garbage", "SmartScan's reply is not JSON"),
-        ("nan", "SmartScan replied"),
         ("dialog", "a dialog may wait on its screen"),
     ],
 )
@@ -159,6 +158,17 @@ def test_bad_reply_is_logged_and_smartscan_reconnected(bench: Make, kind: str, l
     response = peer.act_once_free(names.START_SCAN)
     assert response.ok, response.reason
     assert scans(peer.until(FREE))
+
+
+def test_value_that_is_no_number_is_logged_and_scans_go_on(bench: Make) -> None:
+    made = bench()
+    peer = small(made, **SOON)
+    made.strike("nan")
+    made.until_logged("SmartScan replied")
+    while not (response := peer.act(names.START_SCAN)).ok:  # the frame itself may have been no number
+        assert response.code in (ControlResponse.NOT_FREE, ControlResponse.NO_RESPONSE), response.reason
+    while not scans(peer.until(FREE)):
+        pass
 
 
 def test_unknown_word_is_named_and_not_guessed(bench: Make) -> None:

@@ -42,7 +42,7 @@ from afspm.plugins.asylum.link import Link
 from afspm.plugins.asylum.result_files import AsylumFiles
 from afspm.plugins.asylum.session import Session
 from afspm.plugins.asylum.settings import NAMES, FeedbackSwitch, FrameSettings, TipPlace
-from afspm.plugins.asylum.xop import XopError
+from afspm.plugins.asylum.xop import BadReply, XopError
 
 _LAST_SCAN: Final = "LastScan"
 _AMPLITUDE: Final = "AmplitudeSetpointVolts"
@@ -212,10 +212,13 @@ class Asylum(ScriptedDriver[Session, AsylumActivity]):
     def get(self, vendor: str) -> Value:
         if vendor == names.ENGAGED:
             return self.session().doing().engaged
-        if vendor == names.CONTROLLER:
-            return self.session().controller()
-        if any(row.vendor == vendor and row.type == "text" for row in self.table.values()):
-            return self.session().text("GS", vendor)
+        try:
+            if vendor == names.CONTROLLER:
+                return self.session().controller()
+            if any(row.vendor == vendor and row.type == "text" for row in self.table.values()):
+                return self.session().text("GS", vendor)
+        except BadReply as error:
+            raise Refused(ControlResponse.PARAM_ERROR, str(error)) from error
         return self.session().values([vendor])[vendor]
 
     def refuse_unreachable(self, values: Mapping[str, Value], before: Mapping[str, Value]) -> None:

@@ -43,6 +43,7 @@ from afspm.driver import (
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, both_ways, names
 from afspm.plugins.gxsm import bridge
 from afspm.plugins.gxsm.activity import SHOWS_S, ConnectedGxsm, GxsmActivity, Saving
+from afspm.plugins.gxsm.errors import BadReply
 from afspm.plugins.gxsm.hardware import (
     ABORT,
     APPROACH,
@@ -278,7 +279,10 @@ class Gxsm(Driver):
     def get(self, vendor: str) -> Value:
         if vendor == names.CONTROLLER:
             return f"{self._files.program or 'GXSM'} ({self._offered.kind})"
-        return number(self._ask, self._there(vendor))
+        try:
+            return number(self._ask, self._there(vendor))
+        except BadReply as error:
+            raise Refused(ControlResponse.PARAM_ERROR, str(error)) from error
 
     def set(self, values: Mapping[str, Value]) -> None:
         for vendor, value in values.items():

@@ -83,8 +83,8 @@ class Session:
         """Return values of panels by path.
 
         Raises:
-            ControllerLost: the script fails, or a value is missing, not finite or in another unit than at the start:
-                the reply can't be trusted.
+            ControllerLost: the script fails, or a value is in another unit than at the start: no reply can be trusted.
+            Refused: PARAM_ERROR: a value is missing or not finite.
         """
         # One request for all values: they belong to the same moment, and a poll stays short.
         measured = [path for path in paths if path in self._units]
@@ -99,7 +99,7 @@ class Session:
         for path in paths:
             value = found.get(path)
             if not isinstance(value, bool | int | float | str) or (isinstance(value, float) and not isfinite(value)):
-                raise ControllerLost(f"Studio replied {value} for {path}")
+                raise Refused(ControlResponse.PARAM_ERROR, f"Studio replied {value} for {path}")
         return found
 
     def put(self, values: Mapping[str, Value]) -> None:

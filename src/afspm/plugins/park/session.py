@@ -63,15 +63,14 @@ class Session:
         """Return values by path below `spm`.
 
         Raises:
-            Refused: PARAM_ERROR: SmartScan reports an error.
-            ControllerLost: a value is missing, not finite or not plain.
+            Refused: PARAM_ERROR: SmartScan reports an error, or a value is missing, not finite or not plain.
         """
         try:
             found = self._link.run(f"[{', '.join(f'spm.{path}' for path in paths)}]")
         except SmartScanError as error:
             raise Refused(ControlResponse.PARAM_ERROR, f"SmartScan refused {', '.join(paths)}: {error}") from error
         if not isinstance(found, list) or len(found) != len(paths) or not all(map(_is_value, found)):
-            raise ControllerLost(f"SmartScan replied {found} for {', '.join(paths)}")
+            raise Refused(ControlResponse.PARAM_ERROR, f"SmartScan replied {found} for {', '.join(paths)}")
         return dict(zip(paths, found, strict=True))
 
     def is_number(self, path: str) -> bool:
