@@ -29,7 +29,7 @@ import numpy as np
 from tests.plugins.nanonis.nanonis_bench import Bench, Emulated
 from tests.plugins.vendor_bench import TURNED, Peer, ready, scans
 
-from afspm.model import ControlRequest, Region, Response, Scan, ScanParameters, ScopeState, names
+from afspm.model import ControlRequest, Region, Response, Scan, ScanParameters, ScopeState, Spectrum, names
 from afspm.plugins.nanonis.emulator import NanonisEmulator, as_reported
 
 SHAPE: Final = (12, 32)
@@ -82,6 +82,18 @@ def _stops(peer: Peer) -> list[Response]:
     return [started, stopped]
 
 
+def _sweeps_down(peer: Peer) -> list[Response]:
+    return [peer.set(names.SPEC_Z_FROM, 1e-9), peer.set(names.SPEC_Z_TO, -0.2e-9)]
+
+
+def _takes_curve(peer: Peer) -> list[Response]:
+    points = peer.set(names.SPEC_POINTS, 33)
+    started = peer.act_once_free(names.START_SPEC)
+    peer.until(lambda one: isinstance(one, Spectrum))
+    peer.until(ScopeState.FREE)
+    return [points, started]
+
+
 FACTS: Final[dict[str, Fact]] = {
     as_reported.ZEROS: Fact(),
     as_reported.OVER_RANGE: Fact("beyond the scanner", _sets_beyond),
@@ -96,6 +108,9 @@ FACTS: Final[dict[str, Fact]] = {
         holds=lambda emulated: emulated.software.scans.properties.comment == as_reported.COMMENT
     ),
     as_reported.QPLUS_NAMES: Fact(),
+    as_reported.CURVE_LAYOUT: Fact("does not report whether it saves curves", _takes_curve),
+    as_reported.CURVE_STATUS: Fact("BiasSpectr.StatusGet is not asked from now on", _takes_curve),
+    as_reported.UNSAVED_CURVES: Fact(tries=_takes_curve),
     as_reported.FEW_PIXELS: Fact("scan-resolution-x|scan-size-x"),
     as_reported.UNKNOWN_STATUS: Fact("has the status 9, which no document names"),
     as_reported.DEAF_STOP: Fact("measures on 5 s after the stop", _stops),
@@ -103,6 +118,14 @@ FACTS: Final[dict[str, Fact]] = {
         why="set and returned alike: only a picture shows it, and `afspm commission` asks a person to compare one"
     ),
     as_reported.ROUNDED_READING: Fact("scan-top-left"),
+    as_reported.KEEPS_TIME: Fact(),
+    as_reported.Z_SWEEP_TOWARDS: Fact("x-spec-z-to", _sweeps_down),
+    as_reported.BACKWARD_BY_TIME: Fact(
+        why="curves are saved: only data without a file is mirrored", tries=_takes_curve
+    ),
+    as_reported.COUNTER_CLOCKWISE: Fact(
+        why="set and returned alike: only a picture shows it, and `afspm commission` asks a person to compare one"
+    ),
 }
 
 

@@ -185,7 +185,7 @@ def test_frame_that_is_scanned_at_another_speed_is_refused(bench: Make, monkeypa
     plain = scans._adapt_speed
 
     def keeps_time(*speed: Any) -> None:
-        plain(*speed[:4], 1, speed[5])
+        plain(*speed[:2], *scans.speed[2:4], 1, speed[5])  # also if another speed is set
 
     monkeypatch.setattr(scans, "_adapt_speed", keeps_time)
     response = peer.set(names.SCAN_SIZE_X, "600", "nm")

@@ -133,7 +133,7 @@ def test_missing_module_piezo_is_named_at_the_start_and_refuses_positions(bench:
     made.at_panel(lambda emulator: emulator.software.functions.remove("Piezo."))
     peer = made.start()
     ready(peer)
-    made.until_logged("Nanonis has no module Piezo, so positions of the probe will be refused")
+    made.until_logged("(module Piezo), so positions of the probe will be refused")
     response = peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((1e-9, 0.0)))
     assert response.code == ControlResponse.PARAM_ERROR
     assert "does not report the scanner's range" in response.reason
@@ -405,7 +405,7 @@ OF_THE_STATE = (
 
 
 @pytest.mark.parametrize(
-    ("action", "start", "most"), [(names.START_SPEC, "BiasSpectr.Start", 18), (names.START_SCAN, "Scan.Action", 34)]
+    ("action", "start", "most"), [(names.START_SPEC, "BiasSpectr.Start", 19), (names.START_SCAN, "Scan.Action", 34)]
 )
 def test_measurement_costs_few_questions(bench: Make, action: str, start: str, most: int) -> None:
     # without polls at rest: all questions are of the requests, and of the reported end. Bias, setpoint and speed are

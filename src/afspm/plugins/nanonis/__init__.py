@@ -83,19 +83,23 @@ _LATE_S: Final = 1.0
 """Time beyond the duration of a pulse or tip shaping, experiment time: a real Nanonis begins up to 0.33 s late, moves
 the tip up to 0.5 s later, and its preamplifier needs up to 0.45 s to leave saturation; it reports no end."""
 _APPROACH_SHOWS_S: Final = 3.0
-_BY_VALUE: Final = (
-    geometry.ScanFrame,
+_SIDE: Final = (
     parameter_groups.ScanSpeed,
     parameter_groups.Gains,
     parameter_groups.MoveSpeed,
+    parameter_groups.Slope,
+    parameter_groups.DriftRate,
+    parameter_groups.SafeTip,
+    parameter_groups.SweptBias,
+    parameter_groups.SweptHeight,
+    parameter_groups.LockIn,
 )
-_SIDE: Final = (parameter_groups.Slope, parameter_groups.DriftRate, parameter_groups.SafeTip)
-_OF_CURVES: Final = (parameter_groups.SweptBias, parameter_groups.SweptHeight, parameter_groups.LockIn)
+_SETPOINT: Final = "ZCtrl.Setpnt"
 _GROUPS: Final = (
-    *_BY_VALUE,
+    geometry.ScanFrame,
     *_SIDE,
-    *_OF_CURVES,
     parameter_groups.CurvePoints,
+    parameter_groups.CurveTiming,
     geometry.Probe,
     parameter_groups.FeedbackOn,
     parameter_groups.TipState,
@@ -211,16 +215,17 @@ class Nanonis(Driver):
         self._session: Session | None = None
         self._grabs_at_s = 0.0
         self._left_out: set[str] = set()
+        self._is_unknown_saving = False
         self._kept = KeptSettings(_AT_FIRST)
         ask = self._ask
         self._probe = geometry.Probe(ask, lambda: self.clock.now_s(), self._awaits_scan)
         feedback = parameter_groups.FeedbackOn(ask, lambda holds: self.wait_for(holds, reply_timeout_s))
         self._tip = parameter_groups.TipState(ask, lambda: self.log)
-        self._side = [parameter_groups.SideGroup(group(ask)) for group in _SIDE]
-        vital = (*(group(ask) for group in _BY_VALUE), self._probe, feedback, self._tip, self._kept)
-        of_curves = [group(ask) for group in _OF_CURVES]
-        points = parameter_groups.CurvePoints(ask, lambda: MODULES[str(self._kept[names.SPEC_KIND])])
-        self.groups = (*vital, *self._side, *of_curves, points)
+        self._points = parameter_groups.CurvePoints(ask, self._module)
+        alone = (*(group(ask) for group in _SIDE), self._points, parameter_groups.CurveTiming(ask, self._module))
+        side = [parameter_groups.SideGroup(group, lambda: self.log) for group in alone]
+        self._timing = side[-1]
+        self.groups = (geometry.ScanFrame(ask), *side[:3], self._probe, feedback, self._tip, self._kept, *side[3:])
         self._preamplifier = Preamplifier(ask, preamplifier_range)
         self._tip_shaper = TipShaper(ask, sensor, qplus_bias, lambda: self.log)
         self._files: NanonisFiles
@@ -234,7 +239,6 @@ class Nanonis(Driver):
             self._withdrawal = WithdrawalPort(self._link_to_withdraw, self.clock.monotonic_s, self.log)
         if self._withdrawal is not None:
             self._withdrawal.hold()
-        self._leave_out_unreadable()
         session = self._session = self.session_class(
             self, self._ports, self._reply_timeout_s, self._release, self._code_page
         )
@@ -260,15 +264,12 @@ class Nanonis(Driver):
             )
         self._files.look(folder)
 
+    def _module(self) -> str:
+        return MODULES[str(self._kept[names.SPEC_KIND])]
+
     def _awaits_scan(self) -> bool:
         # it may move the tip before Nanonis shows it as running
         return hasattr(self, "_files") and self._files.what == SCAN and not self._files.was_seen
-
-    def _leave_out_unreadable(self) -> None:
-        for group in self._side:
-            if group.unreadable and not self.table.keys().isdisjoint(group.names):
-                self.log.warning("%s: not supported from now on: %s", ", ".join(group.names), group.unreadable)
-                self.table = self.table.without(group.names)
 
     def close(self) -> None:
         self._close_session()
@@ -353,8 +354,20 @@ class Nanonis(Driver):
         def ask(name: str, *keys: object) -> tuple[Any, ...]:
             return self._ask(name, *keys)[of.place : of.place + 1]  # another value may be infinite
 
-        (value,) = parameter_groups.numbers(ask, of.getter, *of.keys)
+        try:
+            (value,) = parameter_groups.numbers(ask, of.getter, *of.keys)
+        except protocol.UnreadableReply as error:
+            if vendor == _SETPOINT:  # the feedback acts on it
+                raise
+            raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, f"Nanonis' answer can't be read: {error}") from error
         return cast(Value, value)
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        try:
+            super().write(values)
+        except protocol.UnreadableReply as error:  # a vital value ends the contact when it is read
+            reason = f"{', '.join(values)}: Nanonis' answer can't be read: {error}"
+            raise Refused(ControlResponse.PARAM_ERROR, reason) from error
 
     def set(self, values: Mapping[str, Value]) -> None:
         for vendor, value in values.items():
@@ -385,7 +398,7 @@ class Nanonis(Driver):
     def current_a(self) -> float | None:
         try:
             return float(parameter_groups.numbers(self._ask, "Current.Get")[0])
-        except protocol.NanonisError:
+        except (protocol.NanonisError, protocol.UnreadableReply):
             return None
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
@@ -463,7 +476,10 @@ class Nanonis(Driver):
             raise Refused(ControlResponse.ACTION_ERROR, reason)
         if MODULES[kind] not in self._there.opened:
             raise Refused(ControlResponse.ACTION_ERROR, f"Nanonis can't open the module {MODULES[kind]}")
-        self._activity.start_curve(kind)
+        if self._timing.unreadable:  # a limit of the height would take the offset for none
+            reason = f"Nanonis' answer on the height of curves can't be read: {self._timing.unreadable}"
+            raise Refused(ControlResponse.ACTION_ERROR, reason)
+        self._activity.start_curve(kind, is_saved=self._saves_curves())
 
     @action(names.STOP_SPEC)
     def stop_spec(self) -> None:
@@ -536,10 +552,27 @@ class Nanonis(Driver):
     def check_row(cls, row: ParameterSpec) -> None:
         check_row(row)
 
+    def _saves_curves(self) -> bool:
+        why = "its answer has no autosave"
+        try:
+            saves = self._points.save(switch_on=self._autosave)
+        except (protocol.NanonisError, protocol.UnreadableReply) as error:
+            saves, why = None, str(error)
+        if saves is None and not self._is_unknown_saving:
+            self._is_unknown_saving = True
+            self.log.warning("Nanonis does not report whether it saves curves, so each waits for its file: %s", why)
+        if saves is False and self._autosave:
+            self.log.warning("curves are not saved, although saving was switched on: their data comes over TCP")
+        return saves is not False
+
     def _prepare_panel(self) -> None:
         # Set only if the panel differs: one scan, not continuous, saved. PropsGet and PropsSet count differently (in
         # Get, autosave 0 is "all"; in Set, 0 is "no change"), so no value of Get is passed to Set unchanged.
-        continuous, bouncy, autosave, series, comment, *rest = self._ask("Scan.PropsGet")
+        try:
+            continuous, bouncy, autosave, series, comment, *rest = self._ask("Scan.PropsGet")
+        except protocol.UnreadableReply as error:
+            reason = f"it is not known whether the scan would end (*continuous*): {error}"
+            raise Refused(ControlResponse.ACTION_ERROR, reason) from error
         save = self._autosave and autosave != 0
         if continuous or bouncy or save:
             no_change, off, save_all = 0, 2, 1

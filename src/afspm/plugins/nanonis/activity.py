@@ -62,6 +62,7 @@ class NanonisActivity(Activity):
         self._was_safe = False
         self._shows_until_s = 0.0
         self._unseen_s: float | None = None
+        self._unread: set[str] = set()
 
     # --- start and stop ---
 
@@ -72,28 +73,32 @@ class NanonisActivity(Activity):
         self._files.begin(SCAN, self._session_folder(), {"frame": as_list(region)})
         self._shows_until_s = self._clock.monotonic_s() + _SHOWS_S
 
-    def start_curve(self, kind: str) -> None:
+    def start_curve(self, kind: str, *, is_saved: bool) -> None:
         """Start a spectrum; the second connection receives its data.
+
+        Args:
+            is_saved: False: no file is awaited.
 
         Raises:
             Refused: with ACTION_ERROR: Nanonis reports an error within `settles_s`.
         """
         self._stopping = False
-        self.begin(kind)
+        self.begin(kind, is_saved=is_saved)
         self._kind_asked = kind
         same_name = ""
         self._listener.curve(MODULES[kind], same_name)
         self._unseen_s = None
-        self._await_curve(f"{MODULES[kind]}.StatusGet")
+        self._await_curve(MODULES[kind])
 
-    def begin(self, what: str) -> None:
+    def begin(self, what: str, *, is_saved: bool = True) -> None:
         """Register the start of a measurement; a scan gets the frame read from Nanonis."""
         if what == SCAN:
             self.begin_scan(frame(ScanFrame(self._ask).read())[0])
             return
         self.curve = None
         # a spectrum begins right after `status` has found no scan
-        self._files.begin(what, self._session_folder(), {"position": list(self._probe.xy_m(between_scans=True))})
+        facts = {"position": list(self._probe.xy_m(between_scans=True)), **({} if is_saved else {"unsaved": True})}
+        self._files.begin(what, self._session_folder(), facts)
 
     def end(self, path: str | None = None) -> None:
         """Register the end of the measurement.
@@ -103,10 +108,10 @@ class NanonisActivity(Activity):
         """
         self._files.end(self._clock.now_ns(), self._clock.now_s(), path)
 
-    def _await_curve(self, status: str) -> None:
+    def _await_curve(self, module: str) -> None:
         # Nanonis reports a refused start only as the error of the blocking call on the second connection.
         until_s = self._clock.monotonic_s() + self.settles_s
-        while not self._ask(status)[0] and self._clock.monotonic_s() < until_s:
+        while not self._runs(module) and self._clock.monotonic_s() < until_s:
             for event in self._listener.events():
                 if isinstance(event, Exception) and not isinstance(event, ControllerLost):
                     self.forget()
@@ -129,7 +134,8 @@ class NanonisActivity(Activity):
     def stop_curve(self) -> None:
         """Stop the running spectrum."""
         for module in self._opened.intersection(MODULES.values()):
-            if self._says(module, "StatusGet"):
+            is_own = MODULES.get(self._kind_asked) == module
+            if self._runs(module) if is_own else self._says(module, "StatusGet"):
                 self._ask(f"{module}.Stop")
         self.stopped()
 
@@ -212,7 +218,7 @@ class NanonisActivity(Activity):
         return "" if self._tip.is_safe else super().stopped_by_hand()
 
     def _scanning(self, path: str | None) -> ScopeStatus:
-        if path and self._ask("Scan.PropsGet")[0]:  # a continuous scan: one frame has ended, the next is running
+        if path and self._is_continuous():  # one frame has ended, the next is running
             self._files.end_followed(self._clock.now_ns(), self._clock.now_s(), path)
         elif path:
             self.end(path)
@@ -225,6 +231,13 @@ class NanonisActivity(Activity):
                 self.stop_scan()  # the scan may go on in the air, and its picture look plausible
                 self._failed = True
         return ScopeStatus(ScopeState.SCANNING)
+
+    def _is_continuous(self) -> bool:
+        try:
+            return bool(self._ask("Scan.PropsGet")[0])
+        except UnreadableReply as error:
+            self._log.warning("the scan counts as the only one, and not as a frame of a continuous scan: %s", error)
+            return False
 
     def _look_for_new_frame(self) -> None:
         if self._files.what == SCAN:
@@ -245,7 +258,7 @@ class NanonisActivity(Activity):
 
     def stop_approach(self) -> None:
         """Stop a running approach, which would bring a withdrawn tip back."""
-        if self._approaches():
+        if self._approaches() or f"{APPROACH}.OnOffGet" in self._unread:
             off = 0
             self._ask("AutoApproach.OnOffSet", off)
 
@@ -253,15 +266,19 @@ class NanonisActivity(Activity):
         return self._says(APPROACH, "OnOffGet")
 
     def _says(self, module: str, question: str) -> bool:
-        # a module that is not vital: an answer that can't be read ends its use, and not the contact with Nanonis
-        if module not in self._opened:
+        # an answer that is not vital: if it can't be read it is asked no more, and the contact with Nanonis stays
+        if module not in self._opened or (name := f"{module}.{question}") in self._unread:
             return False
         try:
-            return bool(self._ask(f"{module}.{question}")[0])
+            return bool(self._ask(name)[0])
         except UnreadableReply as error:
-            self._opened.discard(module)
-            self._log.warning("the module %s of Nanonis is not used from now on: %s", module, error)
+            self._unread.add(name)
+            self._log.warning("%s is not asked from now on, and what a person does there is not seen: %s", name, error)
             return False
+
+    def _runs(self, module: str) -> bool:
+        # a curve whose status can't be read may run
+        return self._says(module, "StatusGet") or f"{module}.StatusGet" in self._unread
 
     def _kind_running(self) -> str:
         # the blocking call on the second connection reports the end of the translator's own spectra
@@ -276,7 +293,7 @@ class NanonisActivity(Activity):
     def _require_curve(self, module: str) -> None:
         # the blocking call waits for a day, also at a port that accepts the start and answers nothing
         now_s = self._clock.monotonic_s()
-        if self._says(module, "StatusGet") or module not in self._opened:
+        if self._runs(module):
             self._unseen_s = None
         elif self._unseen_s is None:
             self._unseen_s = now_s

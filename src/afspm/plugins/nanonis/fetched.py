@@ -140,6 +140,7 @@ def spectrum(curve: CurveEnded, kind: str, position_m: tuple[float, float]) -> S
     if not curve.names or curve.values.shape[0] != len(curve.names):
         raise FileError(f"a spectrum of {len(curve.names)} channels with {curve.values.shape[0]} rows of values")
     values = np.array(curve.values.T, dtype=np.float64)
+    # (! curve-backward) points of the way back are taken as they come
     columns, units = zip(*map(name_and_unit, curve.names), strict=True)
     return Spectrum(position_m, kind, columns, units, values)
 

@@ -14,7 +14,7 @@ from typing import ClassVar, Final
 from afspm.basics import lengths_text
 from afspm.driver import FRAME, POSITION, ParameterSpec, Value, check_speed, frame, frame_values, refuse_value
 from afspm.model import Region, names
-from afspm.plugins.nanonis.parameter_groups import Ask, Group, MoveSpeed, keep_speed
+from afspm.plugins.nanonis.parameter_groups import Ask, Group, MoveSpeed, keep_speed, set_speed
 from afspm.plugins.nanonis.protocol import BadReply, NanonisError
 
 _OUTPUT_V: Final = 10.0
@@ -46,7 +46,7 @@ class ScanFrame(Group):
         if names.SCAN_RESOLUTION_X in values or names.SCAN_RESOLUTION_Y in values:
             self._ask("Scan.BufferSet", self._ask("Scan.BufferGet")[0], columns, rows)
         # a frame set wider with the time per line kept would be scanned faster, beyond any limit of the speed
-        speed_m_s = keep_speed(self._ask)
+        speeds_m_s = keep_speed(self._ask)
         width, height = region.size_m
         self._ask(
             "Scan.FrameSet",
@@ -55,7 +55,12 @@ class ScanFrame(Group):
             height / _share(rows),
             0.0 - math.degrees(region.angle_rad),
         )
-        check_speed(speed_m_s, self._numbers("Scan.SpeedGet")[0])
+        made_m_s = self._numbers("Scan.SpeedGet")[0]
+        if not math.isclose(speeds_m_s[0], made_m_s, rel_tol=_DIGITS):
+            # (! keep-speed) others keep the time a line although asked to keep the speed
+            set_speed(self._ask, *speeds_m_s, width / _share(columns))
+            made_m_s = self._numbers("Scan.SpeedGet")[0]
+        check_speed(speeds_m_s[0], made_m_s)
 
 
 def _share(pixels: int) -> float:
@@ -132,10 +137,9 @@ class Probe(Group):
         if why := self._unknown_range:
             what = f"Nanonis does not report the scanner's range ({why}), so that no position can be checked"
             raise refuse_value(self.names[0], f"{what}; move the tip at the panel")
-        at_once = 0
+        speed_m_s, at_once = float(MoveSpeed(self._ask).read()[names.MOVE_SPEED]), 0
         self._ask("FolMe.XYPosSet", x, y, at_once)
         self._goal_m = (x, y)
-        speed_m_s = float(MoveSpeed(self._ask).read()[names.MOVE_SPEED])
         self.arrives_s = self._now_s() + (math.dist(before_m, (x, y)) / speed_m_s if speed_m_s > 0.0 else 0.0)
 
     def within(self, reach: Mapping[str, ParameterSpec]) -> Mapping[str, ParameterSpec]:

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Final
 from afspm.basics import Refused
 from afspm.driver import FEEDBACK_ON, SettingsGroup, Value, refuse_value
 from afspm.model import ControlResponse, names
-from afspm.plugins.nanonis.protocol import BadReply, NanonisError
+from afspm.plugins.nanonis.protocol import NanonisError, UnreadableReply
 
 Ask = Callable[..., tuple[Any, ...]]
 
@@ -46,24 +46,27 @@ class Group(SettingsGroup):
 
 
 class SideGroup(SettingsGroup):
-    """A group whose values the tip's safety does not need: answers that can't be read end its use, not the contact.
+    """A group without which scans are possible: an answer that can't be read costs its values, not the contact.
 
     Attributes:
-        unreadable: why the group is left out, after two bad answers in a row; otherwise empty.
+        unreadable: why the last answer could not be read; otherwise empty.
     """
 
-    def __init__(self, group: Group) -> None:
+    def __init__(self, group: Group, log: Callable[[], logging.Logger]) -> None:
         self.names = group.names
-        self._group, self._failed, self.unreadable = group, False, ""
+        self._group, self._log, self._logged, self.unreadable = group, log, "", ""
 
     def read(self) -> dict[str, Value]:
         try:
             found = self._group.read()
-        except BadReply as error:
-            self.unreadable = str(error) if self._failed else ""
-            self._failed = True
-            raise
-        self._failed = False
+        except UnreadableReply as error:
+            self.unreadable = str(error)
+            what = f"{', '.join(self.names)}: not supported while Nanonis' answer can't be read"
+            if self._logged != self.unreadable:
+                self._logged = self.unreadable
+                self._log().warning("%s: %s", what, error)
+            raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, f"{what}: {error}") from error
+        self.unreadable = ""
         return found
 
     def write(self, values: Mapping[str, Value]) -> None:
@@ -74,25 +77,31 @@ def numbers(ask: Ask, name: str, *arguments: object) -> tuple[Any, ...]:
     """Return the results of a function whose numbers must be finite.
 
     Raises:
-        BadReply: a number is infinite or NaN.
+        UnreadableReply: a number is infinite or NaN.
     """
     found = ask(name, *arguments)
     for value in found:
         if isinstance(value, float) and not math.isfinite(value):
-            raise BadReply(f"Nanonis returned {value} in reply to {name}")
+            raise UnreadableReply(f"Nanonis returned {value} in reply to {name}")
     return found
 
 
-def keep_speed(ask: Ask) -> float:
+def keep_speed(ask: Ask) -> tuple[float, float]:
     """Let Nanonis keep both scan speeds when the frame changes, instead of the time per line.
 
     Returns:
-        the forward speed, in m/s.
+        the speeds forward and backward, in m/s.
     """
     *speeds, keeps_time, ratio = ask("Scan.SpeedGet")
     if keeps_time:
         ask("Scan.SpeedSet", *speeds, _KEEP_SPEED, ratio)
-    return float(speeds[0])
+    return float(speeds[0]), float(speeds[1])
+
+
+def set_speed(ask: Ask, forward_m_s: float, backward_m_s: float, width_m: float) -> None:
+    """Set both scan speeds, with the times per line of a frame of this width."""
+    times_s = width_m / forward_m_s, width_m / backward_m_s
+    ask("Scan.SpeedSet", forward_m_s, backward_m_s, *times_s, _KEEP_SPEED, backward_m_s / forward_m_s)
 
 
 class ScanSpeed(Group):
@@ -116,8 +125,7 @@ class ScanSpeed(Group):
                 names.SCAN_SPEED,
                 f"the speeds forward and backward must be above 0, not {forward_m_s:g} and {backward_m_s:g} m/s",
             )
-        times_s = width_m / forward_m_s, width_m / backward_m_s
-        self._ask("Scan.SpeedSet", forward_m_s, backward_m_s, *times_s, _KEEP_SPEED, ratio)
+        set_speed(self._ask, forward_m_s, backward_m_s, width_m)
 
 
 class Gains(Group):
@@ -178,7 +186,7 @@ class TipState(Group):
 
     def __init__(self, ask: Ask, log: Callable[[], logging.Logger]) -> None:
         super().__init__(ask)
-        self._log, self._told = log, set[int]()
+        self._log, self._told = log, set[object]()
         self.is_safe = self.is_withdrawing = self._was_withdrawing = False
 
     @property
@@ -207,9 +215,13 @@ class TipState(Group):
     def _is_at_upper_limit(self) -> bool:
         try:
             high_m, low_m = self._numbers("ZCtrl.LimitsGet")
-        except NanonisError:
-            return False  # the place of a withdrawn tip is not known
-        return bool(self._numbers("ZCtrl.ZPosGet")[0] >= high_m - _END_OF_RANGE * (high_m - low_m))
+            z_m = self._numbers("ZCtrl.ZPosGet")[0]
+        except (NanonisError, UnreadableReply) as error:
+            if str(error) not in self._told:
+                self._told.add(str(error))
+                self._log().warning("a withdrawn tip counts as engaged, since its place is not known: %s", error)
+            return False
+        return bool(z_m >= high_m - _END_OF_RANGE * (high_m - low_m))
 
 
 class SafeTip(Group):
@@ -316,7 +328,10 @@ class SweptBias(Group):
 
 
 class SweptHeight(Group):
-    """First and last height of z spectroscopy: Nanonis has the offset of the first, and the way from there."""
+    """First and last height of z spectroscopy: Nanonis has the offset of the first, and the way from there.
+
+    (! z-sweep-sign)
+    """
 
     names = names.SPEC_Z_ENDS
 
@@ -329,15 +344,13 @@ class SweptHeight(Group):
         self._ask("ZSpectr.RangeSet", first_m, last_m - first_m)
 
 
-class CurvePoints(Group):
-    """The number of points of a curve, and the time to measure each, for the kind of curve in force.
+class OfKind(Group):
+    """A group of values of a curve, for the kind of curve in force.
 
     Args:
         module: returns the module of this kind.
     """
 
-    names = (names.SPEC_POINTS, names.SPEC_POINT_TIME, names.SPEC_Z_OFFSET)
-    _points_at: ClassVar = {"BiasSpectr": 3, "ZSpectr": 1}
     _time_at: ClassVar = {"BiasSpectr": 5, "ZSpectr": 4}
     _offset_at: ClassVar = 1  # of BiasSpectr.TimingGet
 
@@ -345,33 +358,71 @@ class CurvePoints(Group):
         super().__init__(ask)
         self._module = module
 
+
+class CurveTiming(OfKind):
+    """The time to measure each point of a curve, and the height at which it is taken."""
+
+    names = (names.SPEC_POINT_TIME, names.SPEC_Z_OFFSET)
+
     def read(self) -> dict[str, Value]:
         module = self._module()
-        points = self._ask(f"{module}.PropsGet")[self._points_at[module]]
         timing = self._ask(f"{module}.TimingGet")  # not `_numbers`: the slew rate may be infinite
-        found = (points, timing[self._time_at[module]])
-        if module == "BiasSpectr":
-            return dict(zip(self.names, (*found, timing[self._offset_at]), strict=True))
-        return dict(zip(self.names, (*found, self._numbers("ZSpectr.RangeGet")[0]), strict=True))
+        is_bias = module == "BiasSpectr"
+        offset_m = timing[self._offset_at] if is_bias else self._numbers("ZSpectr.RangeGet")[0]
+        return dict(zip(self.names, (timing[self._time_at[module]], offset_m), strict=True))
 
     def write(self, values: Mapping[str, Value]) -> None:
-        module, no_change = self._module(), 0
+        module = self._module()
         if module == "ZSpectr" and names.SPEC_Z_OFFSET in values:
             raise refuse_value(names.SPEC_Z_OFFSET, f"a curve of the height begins at {names.SPEC_Z_FROM}: set that")
         timing = list(self._ask(f"{module}.TimingGet"))
-        if names.SPEC_POINT_TIME in values or names.SPEC_Z_OFFSET in values:
-            timing[self._time_at[module]] = float(values.get(names.SPEC_POINT_TIME, timing[self._time_at[module]]))
-            if module == "BiasSpectr":
-                timing[self._offset_at] = float(values.get(names.SPEC_Z_OFFSET, timing[self._offset_at]))
-            self._ask(f"{module}.TimingSet", *timing)
-        if names.SPEC_POINTS in values:
-            points = int(values[names.SPEC_POINTS])
-            if module == "BiasSpectr":
-                # no value of the offset means no change
-                rest = (points, timing[self._offset_at], no_change, no_change)
-                self._ask("BiasSpectr.PropsSet", no_change, no_change, no_change, *rest)
-            else:
-                self._ask("ZSpectr.PropsSet", no_change, points, no_change, no_change, no_change, no_change)
+        timing[self._time_at[module]] = float(values.get(names.SPEC_POINT_TIME, timing[self._time_at[module]]))
+        if module == "BiasSpectr":
+            timing[self._offset_at] = float(values.get(names.SPEC_Z_OFFSET, timing[self._offset_at]))
+        self._ask(f"{module}.TimingSet", *timing)
+
+
+class CurvePoints(OfKind):
+    """The number of points of a curve, and whether Nanonis saves curves. (! curve-layout)"""
+
+    names = (names.SPEC_POINTS,)
+    _points_at: ClassVar = {"BiasSpectr": 3, "ZSpectr": 1}
+    _saves_at: ClassVar = {"BiasSpectr": 6, "ZSpectr": 5}
+    _with_saves: ClassVar = 8
+    """Number of results of PropsGet in the layout that reports autosave."""
+
+    def read(self) -> dict[str, Value]:
+        module = self._module()
+        return {names.SPEC_POINTS: self._ask(f"{module}.PropsGet")[self._points_at[module]]}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        self._set(points=int(values[names.SPEC_POINTS]))
+
+    def _set(self, *, points: int = 0, saves: int = 0, dialog: int = 0) -> None:
+        # 0 is no change, except for the offset
+        if self._module() == "BiasSpectr":
+            offset_m = self._ask("BiasSpectr.TimingGet")[self._offset_at]
+            self._ask("BiasSpectr.PropsSet", 0, 0, 0, points, offset_m, saves, dialog)
+        else:
+            self._ask("ZSpectr.PropsSet", 0, points, 0, saves, dialog, 0)
+
+    def save(self, *, switch_on: bool) -> bool | None:
+        """Return whether Nanonis saves the next curve; None: it does not report that. See `switch_on`.
+
+        Args:
+            switch_on: whether saving is switched on, unless it is on.
+        """
+        saves = self._saves()
+        if switch_on and not saves:
+            # a dialog that waits on the screen would stop the whole interface
+            self._set(saves=_ON, dialog=_OFF)
+            saves = self._saves()
+        return saves
+
+    def _saves(self) -> bool | None:
+        module = self._module()
+        found = self._ask(f"{module}.PropsGet")
+        return bool(found[self._saves_at[module]]) if len(found) == self._with_saves else None
 
 
 class LockIn(Group):

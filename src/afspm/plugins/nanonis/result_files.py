@@ -101,6 +101,7 @@ class NanonisFiles(ResultFiles):
         if running is not None:
             # Without access to the folder no file can appear: fetch at once.
             patience_s = self._patience_s if Path(running["folder"]).is_dir() else 0.0
+            path = "" if path is None and running.get("unsaved") else path
             self._ends({"reported": path, "end_ns": now_ns, "fetch_at_s": now_s + patience_s})
         if path is not None:
             self._reported(now_s, path)
@@ -190,7 +191,8 @@ class NanonisFiles(ResultFiles):
             raise
         except AfspmError as error:
             if missing:  # it was stopped, which is no fault of a file
-                self._log.warning("the %s was stopped, and has no file: %s", ended["what"], missing)
+                text = "the %s was stopped, and has no file: %s; its data, which is not published, is kept in %s"
+                self._log.warning(text, ended["what"], missing, file or self._written(content, ended, "-stopped"))
             else:
                 what = ended["what"]
                 self._log.error("the %s has no file (%s), and can't be fetched over TCP: %s", what, missed, error)
@@ -198,10 +200,14 @@ class NanonisFiles(ResultFiles):
             return
         if ended["reported"] != "":
             self._log.warning("the %s has no complete file (%s); it was fetched over TCP", ended["what"], missed)
-        self._kept["fetched"] += 1
-        path = self._own_folder / f"nanonis-{self._kept['fetched']:04d}.nc"
-        fetched.write(path, content, ended["end_ns"])
+        path = self._written(content, ended)
         self._take(path, ended, read_result(path))
+
+    def _written(self, content: Content, ended: Entry, mark: str = "") -> Path:
+        self._kept["fetched"] += 1
+        path = self._own_folder / f"nanonis-{self._kept['fetched']:04d}{mark}.nc"
+        fetched.write(path, content, ended["end_ns"])
+        return path
 
     def _take_followed(self, followed: Entry, now_s: float) -> None:
         file = self._file(followed)

@@ -181,7 +181,7 @@ class Session:
         for address in ports.besides(working):
             link = self._connected(address, self._link.release)
             try:
-                with suppress(NanonisError):  # an error is an answer, too
+                with suppress(NanonisError, UnreadableReply):  # an error is an answer, too
                     link.ask("Scan.StatusGet")
             except ControllerLost as error:
                 link.close()
@@ -246,9 +246,10 @@ class Session:
     def _found_release(self) -> int:
         try:
             product, version, host_release, engine_release = self.ask("Util.VersionGet")
-        except NanonisError:
+        except (NanonisError, UnreadableReply) as error:
             self.controller = f"Nanonis, assumed to be release {_WITHOUT_VERSION}"
-            self._log.warning("Nanonis does not report its release; assuming %d (or set release)", _WITHOUT_VERSION)
+            text = "Nanonis does not report its release; assuming %d (or set release): %s"
+            self._log.warning(text, _WITHOUT_VERSION, error)
             return _WITHOUT_VERSION
         self.controller = f"{product} {version}, release {host_release}"
         self._log.info("%s (real-time engine %d)", self.controller, engine_release)
@@ -257,10 +258,10 @@ class Session:
     def _find_range(self) -> None:
         try:
             self.ask("Piezo.RangeGet")
-        except NanonisError as error:
+        except (NanonisError, UnreadableReply) as error:
             text = (
-                "Nanonis has no module Piezo, so positions of the probe will be refused, and no frame is compared with "
-                "the scanner's range: %s"
+                "Nanonis does not report the scanner's range (module Piezo), so positions of the probe will be "
+                "refused, and no frame is compared with it: %s"
             )
             self._log.warning(text, error)
 
@@ -270,6 +271,8 @@ class Session:
         except NanonisError as error:
             self._log.warning("the module %s of Nanonis is not available: %s", module, error)
             return False
+        except UnreadableReply as error:  # its functions refuse if it is not open
+            self._log.info("the module %s of Nanonis counts as open: %s", module, error)
         return True
 
 

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Final
 from afspm.driver import ShadowDriver, require_question
 from afspm.plugins.nanonis import Nanonis
 from afspm.plugins.nanonis.activity import SAFE_TIP, NanonisActivity
-from afspm.plugins.nanonis.protocol import NanonisError
+from afspm.plugins.nanonis.protocol import NanonisError, UnreadableReply
 from afspm.plugins.nanonis.session import APPROACH, Link, Session
 
 QUESTIONS: Final = frozenset({
@@ -41,8 +41,8 @@ class ShadowSession(Session):
     def _open(self, module: str) -> bool:
         try:
             self.ask(f"{module}.OnOffGet" if module == APPROACH else f"{module}.StatusGet")
-        except NanonisError:
-            self._log.warning("the module %s is not open in Nanonis: its work is not seen", module)
+        except (NanonisError, UnreadableReply) as error:
+            self._log.warning("the module %s is not open in Nanonis: its work is not seen (%s)", module, error)
             return False
         return True
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import Final, cast
 
 from afspm.basics import UnitError, convert
-from afspm.plugins.nanonis.protocol import NanonisError
+from afspm.plugins.nanonis.protocol import NanonisError, UnreadableReply
 
 _ADDED: Final = {"log", "abs", "neg"}
 """Words in a z controller's name for what it makes of its signal."""
@@ -42,7 +42,7 @@ def compare(ask: Callable[..., tuple[object, ...]], setpoint_unit: str, log: log
     try:
         controllers, active = cast(tuple[list[str], int], ask("ZCtrl.CtrlListGet"))
         signals = cast(list[str], ask("Signals.NamesGet")[0])
-    except NanonisError as error:
+    except (NanonisError, UnreadableReply) as error:
         log.warning("the active z controller is unknown: compare its unit with the setpoint's yourself: %s", error)
         return
     name = controllers[active] if 0 <= active < len(controllers) else ""

@@ -12,7 +12,14 @@ from typing import Annotated, Any, ClassVar, Final
 from afspm.basics import ConfigError, Count, InvalidValue, Listens, PlainMapping, PositiveLength
 from afspm.emulation import LOOPBACK, ClientConnection, Crashed, Emulator, InstrumentBusy, TcpServer
 from afspm.plugins.nanonis.emulator import as_reported, logger, wire
-from afspm.plugins.nanonis.emulator.dispatch import DeferredResult, FunctionRefused, OtherLayout, Results
+from afspm.plugins.nanonis.emulator.dispatch import (
+    DeferredResult,
+    FunctionRefused,
+    NoResult,
+    OldLayout,
+    OtherLayout,
+    Results,
+)
 from afspm.plugins.nanonis.emulator.software import NanonisSoftware
 
 RELEASES: Final = {"2021": 10862, "2022": 11798, "2023": 13742, "2024": 14429, "2025": 14573}
@@ -319,6 +326,7 @@ class NanonisEmulator(Emulator):
         if not asked.wants_answer:
             return
         now_s = self.clock.now_s()
+        release = min(RELEASES.values()) if isinstance(results, OldLayout) else self._wire_release(now_s)
         encoding = self._encoding
         if self.faults.strikes("not-utf8", now_s):
             encoding = "latin-1"
@@ -329,7 +337,8 @@ class NanonisEmulator(Emulator):
         padded = (*results, *(wire.ZEROS[field.code] for field in fields[len(results) :]))
         if self.faults.lasts("nonsense", now_s):
             padded = tuple(wire.senseless_value(field.code, self._chance) for field in fields)
-        body = wire.body(asked.name, padded, self._wire_release(now_s), encoding)
+        is_empty = isinstance(results, NoResult)
+        body = wire.error_block("", 0) if is_empty else wire.body(asked.name, padded, release, encoding)
         more = b"\0" * 4 if asked.name in self._other_layout or isinstance(results, OtherLayout) else b""
         self._send(connection, asked.sent, body + more)
 

@@ -2,7 +2,7 @@
 
 None of it was seen by us. The claims with the same words in `claims.toml` name the sources: HamsterPark/MAST-public and
 HamsterPark/STM-Bench for a Nanonis, SPMQT-Lab/ScanFlow for another maker's controller, whose faults are shown as far as
-a Nanonis could have them.
+a Nanonis could have them. What STM-Bench's simulator does against the maker's document stands with the latter.
 """
 
 from __future__ import annotations
@@ -21,11 +21,18 @@ BLOCKING_PULSE: Final = "blocking-pulse"
 SLOW_SHAPER: Final = "slow-shaper"
 CODE_PAGE: Final = "code-page"
 QPLUS_NAMES: Final = "qplus-names"
+CURVE_LAYOUT: Final = "curve-layout"
+CURVE_STATUS: Final = "curve-status"
+UNSAVED_CURVES: Final = "unsaved-curves"
 FEW_PIXELS: Final = "few-pixels"
 UNKNOWN_STATUS: Final = "unknown-status"
 DEAF_STOP: Final = "deaf-stop"
 OFFSET_IN_VOLTS: Final = "offset-in-volts"
 ROUNDED_READING: Final = "rounded-reading"
+KEEPS_TIME: Final = "keeps-time"
+Z_SWEEP_TOWARDS: Final = "z-sweep-towards"
+BACKWARD_BY_TIME: Final = "backward-by-time"
+COUNTER_CLOCKWISE: Final = "counter-clockwise"
 
 OF_NANONIS: Final[Mapping[str, str]] = {
     ZEROS: "rows not yet scanned are zeros in memory",
@@ -39,6 +46,9 @@ OF_NANONIS: Final[Mapping[str, str]] = {
     SLOW_SHAPER: "a shaping of the tip begins 0.33 s late",
     CODE_PAGE: "texts are in the code page of a Chinese Windows (GBK), as the comment at the panel is",
     QPLUS_NAMES: "amplitude and phase of a qPlus sensor are called OC D1 Amplitude and OC D1 Phase",
+    CURVE_LAYOUT: "the settings of curves are answered with channels and without autosave, by new releases as well",
+    CURVE_STATUS: "the question whether a curve runs is answered without a result",
+    UNSAVED_CURVES: "saving of curves is off at the panel",
 }
 OF_OTHERS: Final[Mapping[str, str]] = {
     FEW_PIXELS: "a number of pixels is taken without an error, and lines have 16 pixels",
@@ -46,6 +56,10 @@ OF_OTHERS: Final[Mapping[str, str]] = {
     DEAF_STOP: "a stop has no effect, without an error",
     OFFSET_IN_VOLTS: "the centre of a frame is taken for volts: it lies 9.6 times as far away, and is returned as set",
     ROUNDED_READING: "the centre of a frame is returned rounded to 10 nm, and 7 % too large",
+    KEEPS_TIME: "a change of the frame keeps the time a line, although set to keep the speed",
+    Z_SWEEP_TOWARDS: "the distance of a sweep of z counts as an amount, towards the sample",
+    BACKWARD_BY_TIME: "the way back of a curve comes over TCP in the order of time",
+    COUNTER_CLOCKWISE: "the angle of a frame counts counter-clockwise",
 }
 
 COMMENT: Final = "样品 Au(111)"

@@ -21,7 +21,7 @@ _STORED: Final = (
     "TipShaper", "Motor", "AtomTrack", "LockIn", "PLL", "Signals", "UserIn", "UserOut", "TCPLog", "Util", "File",
 )  # fmt: skip
 """Modules of the real software, whose functions without a handler store values in registers."""
-_KEEPS_NAN: Final = ("BiasSpectr.PropsSet",)
+_KEEPS_NAN: Final = ("BiasSpectr.PropsSet", "ZSpectr.RangeSet")
 _MAY_BE_INFINITE: Final = ("BiasSpectr.TimingSet", "ZSpectr.TimingSet")
 """Infinite slew rates mean no limit."""
 
@@ -32,6 +32,14 @@ class FunctionRefused(Exception):
 
 class OtherLayout(tuple[object, ...]):
     """Results that are sent in another layout than documented."""
+
+
+class OldLayout(tuple[object, ...]):
+    """Results that are sent as the oldest release sends them."""
+
+
+class NoResult(tuple[object, ...]):
+    """Results that are left out."""
 
 
 @dataclass(frozen=True)

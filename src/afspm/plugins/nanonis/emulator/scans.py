@@ -184,7 +184,8 @@ class ScanModule:
         size_m = (width * (self.pixels - 1) / self.pixels, height * max(self.lines - 1, 1) / self.lines)
         if as_reported.OFFSET_IN_VOLTS in self._core.reported:
             x, y = as_reported.IN_VOLTS * x, as_reported.IN_VOLTS * y
-        rig.setup.region = Region((x, y), size_m, -math.radians(clockwise_deg))
+        turned = 1.0 if as_reported.COUNTER_CLOCKWISE in self._core.reported else -1.0
+        rig.setup.region = Region((x, y), size_m, turned * math.radians(clockwise_deg))
         rig.setup.shape = (self.lines, self.pixels)
         rig.setup.reach_m = self._core.reach_m
         forward_s, backward_s = self.speed[2:4]
@@ -319,7 +320,8 @@ class ScanModule:
                 for value, size, whole in zip((x, y), (width, height), range_m, strict=True)
             )
         self.frame = (x, y, width, height, angle_deg)
-        self._adapt_speed(*self.speed)
+        *speeds, keeps_time, ratio = self.speed
+        self._adapt_speed(*speeds, keeps_time or as_reported.KEEPS_TIME in self._core.reported, ratio)
         return ()
 
     @answers("Scan.FrameGet")

@@ -10,9 +10,18 @@ import numpy as np
 
 from afspm.basics import ConfigError
 from afspm.emulation import SpectrumActivity, SweptCurve
-from afspm.plugins.nanonis.emulator import files
+from afspm.plugins.nanonis.emulator import as_reported, files
 from afspm.plugins.nanonis.emulator.core import NanonisCore
-from afspm.plugins.nanonis.emulator.dispatch import Answer, DeferredResult, FunctionRefused, Results, answers, chosen
+from afspm.plugins.nanonis.emulator.dispatch import (
+    Answer,
+    DeferredResult,
+    FunctionRefused,
+    NoResult,
+    OldLayout,
+    Results,
+    answers,
+    chosen,
+)
 from afspm.plugins.nanonis.emulator.session import checked_name
 from afspm.plugins.nanonis.emulator.signals import CHANNELS, Signals, name_and_unit, spectrum_columns, spectrum_signal
 
@@ -70,7 +79,9 @@ class SpectroscopyModules:
 
     def __init__(self, core: NanonisCore, signals: Signals) -> None:
         self._core, self._signals = core, signals
-        self.sweeps = {module: SweepSettings() for module in _KINDS}
+        self._reported = core.reported
+        saves = as_reported.UNSAVED_CURVES not in core.reported
+        self.sweeps = {module: SweepSettings(saves=saves) for module in _KINDS}
         self.running: SpectrumActivity | None = None
         self.module = "BiasSpectr"
         self.ended = 0
@@ -108,7 +119,8 @@ class SpectroscopyModules:
         timing, z_range, modulation = changed(f"{module}.Timing"), changed("ZSpectr.Range"), changed("LockIn.ModAmp", 1)
         point_s = sum(timing[4:6] if module == "BiasSpectr" else timing[3:5]) if timing else None
         if module == "ZSpectr":
-            ends = None if z_range is None else (z_range[0], z_range[0] + z_range[1])
+            towards = -1.0 if as_reported.Z_SWEEP_TOWARDS in self._reported else 1.0
+            ends = None if z_range is None else (z_range[0], z_range[0] + towards * z_range[1])
             return SweptCurve(ends, sweep.points, point_s)
         z_offset_m = timing[1] if timing else 0.0
         return SweptCurve(sweep.limits, sweep.points, point_s, z_offset_m, modulation[0] if modulation else None)
@@ -165,6 +177,8 @@ class SpectroscopyModules:
     @answers("BiasSpectr.StatusGet", "ZSpectr.StatusGet")
     def _status(self, name: str) -> Answer:
         module, curve = self._module(name), self.running
+        if as_reported.CURVE_STATUS in self._reported:
+            return NoResult()
         return (int(curve is not None and self.module == module and curve.running(self._core.now_s)),)
 
     @answers("BiasSpectr.Start", "ZSpectr.Start")
@@ -180,6 +194,9 @@ class SpectroscopyModules:
             # (! stopped-spectrum)
             values = curve.values.copy()
             values[self._measured(curve) :] = np.nan
+            if as_reported.BACKWARD_BY_TIME in self._reported:
+                back = [k for k, name in enumerate(curve.names) if name.endswith(" Retrace")]
+                values[:, back] = values[::-1, back]
             return spectrum_columns(curve), values.T, [*curve.position_m, float(curve.values[0, 0])]
 
         return DeferredResult(ready)
@@ -228,7 +245,10 @@ class SpectroscopyModules:
 
     @answers("BiasSpectr.PropsGet", "ZSpectr.PropsGet")
     def _properties(self, name: str) -> Answer:
-        module = self._module(name)
+        found = self._properties_of(self._module(name))
+        return OldLayout(found) if as_reported.CURVE_LAYOUT in self._reported else found
+
+    def _properties_of(self, module: str) -> Results:
         sweep, channels = self.sweeps[module], self._channel_names(module)
         backward, saves, saves_all, dialog = map(int, (sweep.backward, sweep.saves, sweep.saves_all, sweep.dialog))
         fixed = ["X (m)", "Y (m)"]
@@ -238,6 +258,12 @@ class SpectroscopyModules:
             return saves_all, sweep.sweeps, backward, points, channels, ["Sweep Start (V)"], fixed, saves, dialog
         points = sweep.points or settings.force.points
         return backward, points, channels, ["Sweep Start (m)"], fixed, sweep.sweeps, saves, dialog, saves_all
+
+    @answers("ZSpectr.RangeSet")
+    def _set_range(self, offset_m: float, way_m: float) -> Answer:
+        way_m = abs(way_m) if as_reported.Z_SWEEP_TOWARDS in self._reported else way_m
+        self._core.registers.set("ZSpectr.RangeSet", (offset_m, way_m))
+        return ()
 
     @answers("BiasSpectr.LimitsSet")
     def _set_limits(self, first_v: float, last_v: float) -> Answer:
