@@ -10,6 +10,7 @@ from deadlines import DEADLINE_S
 from tests.plugins.nanonis.nanonis_bench import Bench
 from tests.plugins.vendor_bench import SOON, scanned, scans, small, states
 
+from afspm.driver import read_result
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -22,7 +23,6 @@ from afspm.model import (
     Spectrum,
     names,
 )
-from afspm.storage.formats import read
 from afspm.supervisor import FreePorts
 
 Make = Callable[..., Bench]
@@ -307,7 +307,7 @@ def test_scan_stopped_at_the_panel_is_interrupted(bench: Make) -> None:
     assert not scans(received)
     made.until_logged("its data, which is not published, is kept in")  # stmsim K6
     (kept,) = made.folder.rglob("nanonis-*-stopped.nc")
-    assert {one.values.shape for one in read(kept)} == {(8, 16)}
+    assert {one.values.shape for one in read_result(kept)} == {(8, 16)}
 
 
 def test_scan_stopped_within_its_first_line_is_no_scan_of_zeros(bench: Make) -> None:
