@@ -491,3 +491,40 @@ def test_safe_tip_that_is_on_is_reported_with_its_threshold(tmp_path: Path) -> N
     assert not any("WARNING" in line for line in person.shown if not line.startswith("logged: "))
     assert result.claims["grabbed-rows"] == "not shown"
     assert not InstrumentReport.read(tmp_path / "report.toml").unrestored
+
+
+# makers C2: "control was lost: translator_test is not in control"
+def test_tip_withdrawn_at_the_panel_when_the_step_asks_for_it_lets_the_evening_go_on(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "afspm", "emulate", "nanonis", "withdrawn=false", "--port", "0", "-o", "files"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, encoding="utf-8") as emulator:
+        try:
+            assert emulator.stdout is not None
+            listens = re.search(r"127\.0\.0\.1:(\d+)", emulator.stdout.readline())
+            assert listens
+            link = nanonis.Link(("127.0.0.1", int(listens[1])), DEADLINE_S, time.monotonic)
+            questions = 0
+
+            def withdraw() -> str:
+                nonlocal questions
+                questions += 1
+                if questions == 1:
+                    link.ask("ZCtrl.Withdraw", 1, -1)
+                return "y"
+
+            experiment = tmp_path / "experiment.toml"
+            at = f'[microscope]\ncomponent = true\nclass = "Nanonis"\naddress = "127.0.0.1:{listens[1]}"\n'
+            experiment.write_text(at, encoding="utf-8")
+            agrees = iter("yyyn")  # to the frame, its turn and a scan in the air
+            says: dict[str, str | bool | Callable[[], str]] = {"Shall afspm do this now": lambda: next(agrees, "n")}
+            person = Person(says | {"scanner can't reach it": withdraw})
+            options = CheckOptions([experiment], runs=tmp_path / "runs", patience=REHEARSAL_PATIENCE)
+            result = commission(options, person, tmp_path / "report.toml", "emulator", has_panel=True)
+            link.close()
+        finally:
+            emulator.kill()
+    assert not result.lost
+    found = result.progress.results["withdrawn"]
+    assert found.line.startswith("confirmed: x-engaged reads false"), person.shown
+    assert result.progress.results["scan"].outcome is CheckOutcome.PASSED
+    assert sum("Is this the controller in front" in line for line in person.shown) == 1, "no passed step is repeated"
+    assert not any("not put back" in line for line in person.shown)

@@ -19,7 +19,7 @@ from afspm.testing.commissioning.guide import Guide, Prompts
 from afspm.testing.commissioning.maker_claims import MakerClaim
 from afspm.testing.commissioning.progress import CommissioningProgress
 from afspm.testing.commissioning.report import InstrumentReport, steps_of
-from afspm.testing.commissioning.steps import WITHDRAWN, all_steps
+from afspm.testing.commissioning.steps import WITHDRAWN, Reopened, all_steps
 from afspm.testing.conformance import CheckOutcome, CheckResult, Failed, Lost, Skipped, attempt, counted, mark
 from afspm.testing.translators.client import value_in
 from afspm.testing.translators.report import CheckReport
@@ -80,18 +80,25 @@ def commission(
         KeyboardInterrupt: the scan was stopped, the tip withdrawn if it was in contact, and all settings restored.
     """
     result = CommissioningResult(CommissioningProgress.resumed(all_steps(), before.results() if before else {}), file)
-    try:
-        with ExitStack() as stack:
-            session = stack.enter_context(opened(_traced(options, stack)))
-            result.folder = session.folder
-            if has_panel is None:
-                has_panel = not session.simulated
-            claims = maker_claims.read(session.driver_folder) if session.driver_folder else {}
-            kept = before.claims if before else {}
-            result.claims = {name: kept.get(name, maker_claims.NOT_SHOWN) for name, one in claims.items() if one.step}
-            _in_session(session, prompts, result, tried_on, claims, has_panel=has_panel)
-    except Lost as lost:
-        result.lost = str(lost)
+    result.claims = dict(before.claims) if before else {}
+    for is_again in (False, True):
+        try:
+            with ExitStack() as stack:
+                session = stack.enter_context(opened(_traced(options, stack)))
+                result.folder = session.folder
+                if has_panel is None:
+                    has_panel = not session.simulated
+                claims = maker_claims.read(session.driver_folder) if session.driver_folder else {}
+                kept = result.claims
+                settled = {name: one for name, one in claims.items() if one.step}
+                result.claims = {name: kept.get(name, maker_claims.NOT_SHOWN) for name in settled}
+                _in_session(session, prompts, result, tried_on, claims, has_panel=has_panel)
+        except Lost as lost:
+            if isinstance(lost, Reopened) and not is_again:
+                prompts.show("  You have withdrawn the tip at the panel. afspm connects again, and goes on here.")
+                continue
+            result.lost = str(lost)
+        break
     return result
 
 
@@ -129,6 +136,9 @@ def _in_session(
                 walk.through()
             finally:
                 walk.withdraw()
+    except Reopened:
+        checks.unrestored = []  # no step before it sets anything, and without control nothing can be compared
+        raise
     finally:
         write()
         for line in checks.unrestored:

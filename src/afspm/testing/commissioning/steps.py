@@ -44,6 +44,10 @@ _STEPS: list[CommissioningStep] = []
 _FRAME = (names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
 
 
+class Reopened(Lost):
+    """The exception that the person has withdrawn the tip at the panel, as asked: a new run has to go on."""
+
+
 def all_steps() -> tuple[CommissioningStep, ...]:
     return tuple(_STEPS)
 
@@ -94,6 +98,7 @@ def _controller(guide: Guide) -> str:
 )
 def _panel(guide: Guide) -> str:
     guide.prompts.text("Press Enter when the frame is set")
+    _go_on(guide)
     guide.kit.client.quiet()
     count = _compare_frame(guide, frames.current_frame(guide.kit)) + _compare_values(guide)
     if not count:
@@ -168,7 +173,16 @@ def _safe_tip(guide: Guide) -> str:
 def _withdrawn(guide: Guide) -> str:
     if not guide.prompts.confirm("Is the tip so far from the sample that the scanner can't reach it?"):
         raise Declined("the tip is not withdrawn")
-    return _agreed(guide, at_sample=False)
+    # A withdrawal at the panel takes control away, at once or at the next reading, and a run that has seen the tip at
+    # the sample measures nothing in the air. A new run takes the tip as it finds it.
+    try:
+        line = _agreed(guide, at_sample=False)
+    except Lost as lost:
+        raise Reopened(str(lost)) from lost
+    began = guide.kit.support.parameters.get(names.ENGAGED)
+    if began is not None and began.value == "true":
+        raise Reopened("the tip was at the sample when this run began")
+    return line
 
 
 def _agreed(guide: Guide, *, at_sample: bool) -> str:
@@ -394,11 +408,16 @@ def _stop_at_panel(guide: Guide) -> str:
         raise Skipped("not stopped at the panel")
     client.wait_state(ScopeState.FREE, mark, client.real_s(60.0))
     observed = client.settled(mark)
-    while to_do := client.continue_run(_LOST_S):
-        if guide.prompts.text(f"{to_do}. Then press Enter (u: leave it)").strip():
-            raise Lost(to_do)
+    _go_on(guide)
     expect(not published(observed), "no scan that was stopped at the panel", describe_all(observed))
     return "noticed, and no scan was published"
+
+
+def _go_on(guide: Guide) -> None:
+    # an act at the panel that a step asks for may take control away
+    while to_do := guide.kit.client.continue_run(_LOST_S):
+        if guide.prompts.text(f"{to_do}. Then press Enter (u: leave it)").strip():
+            raise Lost(to_do)
 
 
 @_step(
@@ -442,6 +461,7 @@ def _contact(guide: Guide) -> str:
         )
     if not guide.prompts.confirm("Is the tip at the sample, and the feedback stable?"):
         raise Declined("the tip stays withdrawn")
+    _go_on(guide)
     guide.in_contact = True
     if guide.approaches and guide.kit.support.has(names.ENGAGE, names.ENGAGED):
         mark = guide.kit.client.observations.mark()
