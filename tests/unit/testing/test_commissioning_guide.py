@@ -118,3 +118,12 @@ def test_person_is_not_asked_about_the_tip_of_a_microscope_without_one() -> None
     assert not person.asked + person.shown
     assert guide(person, has_panel=True).perform(about_tip[0]).startswith("on your word alone")
     assert len(person.asked) == 1
+
+
+# stmsim K8: asked for without end
+@pytest.mark.parametrize(("typed", "says"), [("wide", "not understood: "), ("7 nm", "which is not 7 nm")])
+def test_value_is_asked_for_a_limited_number_of_times(typed: str, says: str) -> None:
+    person = Person({"Is 7 nm what the panel shows": "n", "width": typed})
+    with pytest.raises(Skipped, match=r"width: none of 5 answers could be compared with 5 nm"):
+        guide(person, has_panel=True).compare("width", 5.0, "nm")
+    assert sum(says in line for line in (*person.shown, *person.asked)) == 5

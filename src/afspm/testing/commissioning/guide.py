@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Final, Protocol
 
 from afspm.basics.clock import Clock
 from afspm.basics.errors import UnitError
@@ -32,6 +32,8 @@ class Prompts(Protocol):
 
 
 UNSEEN = "unseen"
+_TRIES: Final = 5
+"""Most questions for one value."""
 NO_PANEL = "a simulated microscope has no panel"
 
 
@@ -178,12 +180,13 @@ class Guide:
 
         Raises:
             Failed: the values differ by more than 1 % and `absolute`, and the person confirms the typed value.
+            Skipped: no answer could be compared.
         """
         shown = f"{value:.6g} {unit}".rstrip()
         question = f"{what}, as the panel shows it{f', e.g. in {unit}' if unit else ''}"
         if not self._can_be_seen(question):
             return False
-        while True:
+        for _ in range(_TRIES):
             typed = self.prompts.text(question)
             if not typed.strip():
                 return False
@@ -199,6 +202,7 @@ class Guide:
             if self.prompts.confirm(f"  afspm reads {shown}, which is not {typed}. Is {typed} what the panel shows?"):
                 self.seen[shows] = False
                 raise Failed(f"{what} as at the panel, {typed}", shown)
+        raise Skipped(f"{what}: none of {_TRIES} answers could be compared with {shown}")
 
     def compare_angle(self, turned_deg: float) -> bool:
         """Compare a counter-clockwise angle with the number at the panel, which may count clockwise."""
