@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,9 +14,11 @@ from deadlines import DEADLINE_S
 from tests.plugins.nanonis.nanonis_bench import Bench, Emulated
 from tests.plugins.vendor_bench import PATIENT, SOON, Peer, scanned, small
 
+from afspm.driver import ControllerLost
 from afspm.emulation import ClientConnection
 from afspm.model import ControlResponse, Scan, ScopeState, Spectrum, names
 from afspm.plugins.nanonis.emulator import DelayedReply
+from afspm.plugins.nanonis.session import WithdrawalPort
 
 Make = Callable[..., Bench]
 FREE, UNDEFINED = ScopeState.FREE, ScopeState.UNDEFINED
@@ -222,3 +226,31 @@ def test_curve_whose_answer_is_lost_is_published_from_its_file(bench: Make) -> N
     at_second(made, lambda _, connection: setattr(connection, "waits_for", DelayedReply(b"", 1e12)))
     made.until_logged("BiasSpectr.Start has no answer, and for 10 s no curve has run")
     peer.until(lambda one: isinstance(one, Spectrum))
+
+
+# makers W1: a false ERROR after each short network loss
+@pytest.mark.parametrize(("lasts_s", "is_error"), [(0.0, False), (15.0, False), (25.0, True)])
+def test_short_loss_of_the_network_is_no_error_of_the_port_for_withdrawing(
+    lasts_s: float, is_error: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    now_s, lost_until_s, links = 0.0, 0.0, list[Any]()
+
+    def connected(timeout_s: float) -> Any:
+        made_s = now_s
+
+        def ask(name: str) -> None:
+            if now_s < lost_until_s or made_s < lost_until_s <= now_s:
+                raise ControllerLost("the network is down")
+
+        links.append(SimpleNamespace(ask=ask, close=lambda: None))
+        return links[-1]
+
+    port = WithdrawalPort(connected, lambda: now_s, logging.getLogger("nanonis"))
+    port.hold()
+    now_s = 60.0  # the loss is found at the next question only, up to a minute late
+    lost_until_s = now_s + lasts_s
+    while now_s < 120.0:
+        port.hold()
+        now_s += 1.0
+    assert ("no way is left" in caplog.text) is is_error
+    assert len(links) > 1, "connected again"

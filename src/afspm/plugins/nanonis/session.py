@@ -25,6 +25,10 @@ _WITHOUT_VERSION: Final = 10862
 _WAIT_MS: Final = 1000
 _LONGEST_CURVE_S: Final = 24 * 3600.0
 _HELD_EVERY_S: Final = 60.0
+_MISSED_EVERY_S: Final = 10.0
+_MOST_MISSED: Final = 3
+"""Questions in a row without an answer, after which no way is left to withdraw the tip: a network is often lost for
+seconds, and the connection held meanwhile is found dead only at the next question."""
 _WITHDRAWS_WITHIN_S: Final = 2.0
 """Longest wait for an answer of the port that is kept for withdrawing, real time."""
 _HINTS: Final = (
@@ -414,23 +418,33 @@ class WithdrawalPort:
         self._connected, self._monotonic_s, self._log = connected, monotonic_s, log
         self._link: Link | None = None
         self._next_s = -math.inf
-        self._is_missed = False
+        self._missed = 0
 
     def hold(self) -> None:
-        """Ask a question if the last one was a minute ago, over a new connection if the old one is lost."""
+        """Ask a question if the last one was a minute ago, over a new connection if the old one is lost.
+
+        Without an answer it is asked again after some seconds.
+        """
         if self._monotonic_s() < self._next_s:
             return
-        self._next_s = self._monotonic_s() + _HELD_EVERY_S
+        was_held = self._link is not None
         try:
-            self._asked("ZCtrl.OnOffGet")
+            try:
+                self._asked("ZCtrl.OnOffGet")
+            except ControllerLost:
+                if not was_held or self._link is not None:
+                    raise
+                self._asked("ZCtrl.OnOffGet")  # over a new connection
         except AfspmError as error:
-            if not self._is_missed:
+            self._missed += 1
+            self._next_s = self._monotonic_s() + _MISSED_EVERY_S
+            if self._missed == _MOST_MISSED:
                 self._log.error("no way is left to withdraw the tip if the first port falls silent: %s", error)
-            self._is_missed = True
             return
-        if self._is_missed:
+        self._next_s = self._monotonic_s() + _HELD_EVERY_S
+        if self._missed >= _MOST_MISSED:
             self._log.info("the port kept for withdrawing the tip answers again")
-        self._is_missed = False
+        self._missed = 0
 
     def withdraw(self) -> None:
         """Stop approach and measurement, and withdraw the tip by its piezo.
