@@ -58,6 +58,8 @@ class TreatmentEnd:
         """Return the state of the microscope until the end is proved; None if no end is awaited."""
         found = self._kept.get(_KEY)
         if found is None:
+            if _UNPROVED in self._kept and self._is_on():
+                del self._kept[_UNPROVED]
             return None
         seen, now_s = self._driver.status(), self._driver.clock.now_s()
         if seen.state is not ScopeState.FREE:
@@ -66,7 +68,8 @@ class TreatmentEnd:
         is_near = is_on and 1.0 / NEAR <= ratio <= NEAR
         near_s = found["near_s"] = (found.get("near_s") or now_s) if is_near else None
         is_over = near_s is not None and now_s - near_s >= BETWEEN_S
-        if not is_over and now_s - free_s < LONGEST_S:
+        # a current that has just come back is read once more
+        if not is_over and (now_s - free_s < LONGEST_S or is_near):
             found["next_s"] = now_s + _LOOK_S if near_s is None else near_s + BETWEEN_S
             return ScopeStatus(ScopeState[found["state"]])
         if not is_over:
@@ -74,12 +77,13 @@ class TreatmentEnd:
                 "%g s after %s the current is not at its setpoint: the feedback is %s, the current %.3g of the setpoint"
             )
             self._log.warning(text, LONGEST_S, found["action"], "on" if is_on else "off", ratio)
-            self._kept[_UNPROVED] = found["action"]
+            if not is_on:  # a feedback that is on is switched off later by others than the treatment
+                self._kept[_UNPROVED] = found["action"]
         self.forget()
         return seen
 
     def refuse_start(self) -> None:
-        """Refuse a measurement after a treatment without a proved end, unless the feedback is on now.
+        """Refuse a measurement after a treatment that has left the feedback off, unless the feedback was on since.
 
         Raises:
             Refused: ACTION_ERROR.

@@ -103,6 +103,33 @@ def test_treatment_without_its_current_ends_with_a_warning_and_starts_need_the_f
     treated.end.refuse_start()
 
 
+# makers L1
+@pytest.mark.parametrize("is_left_off", [True, False])
+def test_feedback_that_the_run_switches_off_after_an_unproved_treatment_lets_it_measure(
+    treated: Treated, is_left_off: bool
+) -> None:
+    treated.tip.current, treated.tip.on = 0.0, not is_left_off
+    assert treated.later(0.1) is MOVING
+    assert treated.later(LONGEST_S) is FREE
+    treated.tip.on = True
+    assert treated.later(1.0) is None
+    treated.tip.on = False
+    treated.end.refuse_start()
+
+
+# makers L1: "not at its setpoint … 1.01 of the setpoint"
+def test_current_that_comes_back_at_the_last_moment_is_read_once_more(
+    treated: Treated, caplog: pytest.LogCaptureFixture
+) -> None:
+    treated.tip.current = 1e-8
+    assert treated.later(0.1) is MOVING
+    assert treated.later(LONGEST_S - 0.1) is MOVING
+    treated.tip.current = 1.01e-10
+    assert treated.later(0.1) is MOVING
+    assert treated.later(BETWEEN_S) is FREE
+    assert not caplog.text
+
+
 @pytest.mark.parametrize("why", ["deflection", "no current shown", "feedback off"])
 def test_nothing_is_awaited_where_the_feedback_holds_no_current(why: str) -> None:
     tip = Tip("V" if why == "deflection" else "nA")
