@@ -22,6 +22,8 @@ confirm it. The first steps only read (connecting may change how the controller 
 stops the scan, puts the settings back, and withdraws the tip if it is at the sample. The same command goes on later."""
 
 
+_TRIED_ON = """The report says what was tried: an instrument, with its scanner and a sample; or a maker's program: the
+maker's own software without an instrument, with the scanner that it simulates."""
 # an input that repeats a wrong answer (a pipe) must not loop for ever
 _TRIES = 5
 _STYLES = {"✓": "green", "✗": "bold red", "–": "yellow"}
@@ -58,6 +60,8 @@ def commission(
     before = None if anew else _before(file)
     if before is not None:
         terminal.show(f"continuing with {file}: steps that passed are not repeated")
+    if not simulated:
+        terminal.show(_TRIED_ON)
     tried_on = "emulator" if simulated else terminal.choose("Which controller is connected?", TRIED_ON[:2])
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     ended = walk(options, terminal, file, tried_on, before)

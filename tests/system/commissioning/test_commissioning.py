@@ -108,7 +108,8 @@ def commissioned(
 
 @pytest.mark.parametrize("vendor", VENDORS)
 def test_a_controller_that_is_right_passes_and_the_report_says_what_was_tried(vendor: str, tmp_path: Path) -> None:
-    result = commissioned(tmp_path, vendor, Person())
+    person = Person()
+    result = commissioned(tmp_path, vendor, person)
     lines = {name: f"{one.outcome.value}: {one.line}" for name, one in result.progress.results.items()}
     assert result.passed, (result.lost, [line for line in lines.values() if not line.startswith("passed")])
     report = InstrumentReport.read(tmp_path / "report.toml")
@@ -116,6 +117,8 @@ def test_a_controller_that_is_right_passes_and_the_report_says_what_was_tried(ve
     assert report.tried_on == "emulator"
     assert report.operations["scan"] == report.operations["axes"] == report.operations["stop"] == "passed", lines
     assert vendor != "Nanonis" or report.claims["withdrawn-limit"] == "holds"
+    verdicts = {name: [line for line in person.shown if line.endswith(f" ({name})")] for name in report.claims}
+    assert not {name: shown for name, shown in verdicts.items() if len(shown) > 1}  # makers C4: not shown, then holds
     assert ("on your word alone" in lines["withdrawn"]) is (vendor not in ("Nanonis", "Asylum")), lines
     exchanges = [one for one in read_trace(result.folder / FILE) if isinstance(one, TracedExchange)]
     assert any("start-scan" in one.command for one in exchanges)

@@ -136,6 +136,7 @@ def _in_session(
                 walk.through()
             finally:
                 walk.withdraw()
+                walk.show_unsettled()
     except Reopened:
         checks.unrestored = []  # no step before it sets anything, and without control nothing can be compared
         raise
@@ -155,6 +156,7 @@ class _Walk:
         self._progress = result.progress
         self._claims = result.claims
         self._write = write
+        self._unsettled: list[str] = []
 
     def through(self) -> None:
         """Run the remaining steps."""
@@ -172,9 +174,21 @@ class _Walk:
 
     def _settle(self, step: str) -> None:
         settled = maker_claims.verdicts(self._guide.claims, step, self._guide.seen, self._guide.unprepared)
-        self._claims.update(settled)
         for name, verdict in settled.items():
-            self._guide.prompts.show(f"  {verdict}: {self._guide.claims[name].claim} ({name})")
+            if verdict == maker_claims.NOT_SHOWN:  # a later step may show it still, such as the withdrawal
+                self._unsettled.append(name)
+            elif verdict != self._claims.get(name):
+                self._claims[name] = verdict
+                self._show(name)
+
+    def show_unsettled(self) -> None:
+        """Show the claims that the steps of this evening should have settled, and have not."""
+        for name in dict.fromkeys(self._unsettled):
+            if self._claims[name] == maker_claims.NOT_SHOWN:
+                self._show(name)
+
+    def _show(self, name: str) -> None:
+        self._guide.prompts.show(f"  {self._claims[name]}: {self._guide.claims[name].claim} ({name})")
 
     def withdraw(self) -> None:
         """Withdraw a tip that was approached for these steps."""
