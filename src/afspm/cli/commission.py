@@ -37,6 +37,7 @@ def commission(
     runs: Runs = RUNS,
     frame: WithinFrame = "",
     anew: Annotated[bool, opt("Repeat all steps, also passed ones.", "--anew")] = False,  # word: anew
+    only: Annotated[str, opt("Only this step, with the questions about the tip: moved-frame.", "--only")] = "",
     speed: CheckSpeed = 20.0,
 ) -> None:
     """Take a new controller into use, step by step, with the tip withdrawn first.
@@ -56,15 +57,15 @@ def commission(
         options = replace(options, patience=REHEARSAL_PATIENCE)
     terminal = Terminal()
     terminal.show(_INTRODUCTION)
-    file = report or Path(f"{files[0].stem}-commissioning.toml")
-    before = None if anew else _before(file)
+    file = report or Path(f"{files[0].stem}-{only or 'commissioning'}.toml")
+    before = None if anew or only else _before(file)
     if before is not None:
         terminal.show(f"continuing with {file}: steps that passed are not repeated")
     if not simulated:
         terminal.show(_TRIED_ON)
     tried_on = "emulator" if simulated else terminal.choose("Which controller is connected?", TRIED_ON[:2])
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    ended = walk(options, terminal, file, tried_on, before)
+    ended = walk(options, terminal, file, tried_on, before, only=only)
     if ended.lost:
         terminal.show(f"not completed: {ended.lost}")
     terminal.show(f"\nthe report: {file}")

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
+
+import numpy as np
 
 from afspm.basics import FileError, entry_points
 from afspm.driver import Driver
 from afspm.model import Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.plugins.nanonis import Nanonis
 from afspm.plugins.nanonis.emulator import NanonisEmulator
+from afspm.plugins.nanosurf.emulator import NanosurfEmulator
+from afspm.simulation.scanning import Course
 
 LATE_S = 120.0
 """Experiment seconds."""
@@ -94,3 +98,39 @@ class CoarseNanonisEmulator(NanonisEmulator):
         address = super().open()
         self.software.scans.pixels = self.software.scans.lines = 32
         return address
+
+
+def turn(angle_rad: float) -> Any:
+    return np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
+
+
+PLACES: dict[str, Callable[[float], Any]] = {
+    "x mirrored": lambda angle_rad: np.diag([-1.0, 1.0]),
+    "y mirrored": lambda angle_rad: np.diag([1.0, -1.0]),
+    "swapped": lambda angle_rad: np.array([[0.0, 1.0], [1.0, 0.0]]),
+    "scale": lambda angle_rad: np.diag([1.1, 1.1]),
+    "scale of y": lambda angle_rad: np.diag([1.0, 0.9]),
+    "angle": lambda angle_rad: turn(np.radians(5.0)),
+    "other way": lambda angle_rad: turn(-2.0 * angle_rad),
+}
+
+
+class WrongScanner:
+    """A controller whose pixels are elsewhere about the centre of the frame, in the laboratory's axes, by `fault`."""
+
+    def __init__(self, *, fault: str, **settings: Any) -> None:
+        def pixels_m(course: Course) -> tuple[Any, Any]:
+            (x, y), center = course.region.pixels_m(course.shape), np.array(course.region.center_m)
+            placed = PLACES[fault](course.region.angle_rad) @ (np.stack([x.ravel(), y.ravel()]) - center[:, None])
+            return tuple(one.reshape(x.shape) + at for one, at in zip(placed, center, strict=True))
+
+        Course.pixels_m = pixels_m  # type: ignore[method-assign, assignment]  # of this process alone
+        super().__init__(**settings)
+
+
+class WrongNanonisEmulator(WrongScanner, NanonisEmulator):
+    """The emulated Nanonis with such a scanner."""
+
+
+class WrongNanosurfEmulator(WrongScanner, NanosurfEmulator):
+    """The emulated Nanosurf with such a scanner."""

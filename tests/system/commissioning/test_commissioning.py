@@ -21,6 +21,7 @@ from makers import MAKERS
 from rotation import rotated
 from systems import can_interrupt, freeze, interrupt, not_on_wine
 
+from afspm.basics import ConfigError
 from afspm.driver import Driver
 from afspm.plugins.asylum import Asylum
 from afspm.plugins.asylum import link as asylum
@@ -95,6 +96,8 @@ def commissioned(
     patience: float = REHEARSAL_PATIENCE,
     settings: str = "",
     controller: str = "",
+    only: str = "",
+    frame_m: float | None = None,
 ) -> CommissioningResult:
     shutil.copy(HERE / "spoiled.py", folder)
     file = folder / "experiment.toml"
@@ -102,8 +105,15 @@ def commissioned(
     file.write_text(text + settings, encoding="utf-8")
     report = folder / "report.toml"
     before = InstrumentReport.read(report) if report.exists() else None
-    options = CheckOptions([file], runs=folder / "runs", patience=patience)
-    return commission(options, person, report, "emulator", before, has_panel=True)
+    options = CheckOptions([file], runs=folder / "runs", patience=patience, frame_m=frame_m)
+    return commission(options, person, report, "emulator", before, has_panel=True, only=only)
+
+
+@pytest.fixture
+def spoiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make `spoiled.py` importable, in the processes of the experiment, too."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
 
 
 @pytest.mark.parametrize("vendor", VENDORS)
@@ -128,8 +138,8 @@ def test_a_controller_that_is_right_passes_and_the_report_says_what_was_tried(ve
 @pytest.mark.parametrize(
     ("fault", "step", "said"),
     [
-        ("MirroredY", "axes", "with y mirrored"),
-        ("OtherWay", "axes", "with angles the other way round"),
+        ("MirroredY", "moved-frame", "y is mirrored"),
+        ("OtherWay", "moved-frame", "a frame turned by 20 deg is turned by -"),
         ("LateEnd", "scan", "until its end was noticed"),
     ],
 )
@@ -148,7 +158,7 @@ def test_fault_of_a_controller_is_found(
     assert said in found.line or (fault == "OtherWay" and "SS_INTERRUPTED" in found.line)
     assert any("What to do: " in line for line in person.shown)
     assert not result.passed
-    if step == "axes":
+    if step == "moved-frame":
         assert any("The tip was withdrawn" in line or "WITHDRAW" in line.upper() for line in person.shown)
     else:  # nothing that needs the step is done
         assert result.progress.results["axes"].outcome is CheckOutcome.BLOCKED
@@ -531,3 +541,33 @@ def test_tip_withdrawn_at_the_panel_when_the_step_asks_for_it_lets_the_evening_g
     assert result.progress.results["scan"].outcome is CheckOutcome.PASSED
     assert sum("Is this the controller in front" in line for line in person.shown) == 1, "no passed step is repeated"
     assert not any("not put back" in line for line in person.shown)
+
+
+# users U15
+@pytest.mark.parametrize(
+    ("vendor", "fault", "said"),
+    [
+        ("Nanonis", "x mirrored", "came x is mirrored$"),
+        ("Nanosurf", "y mirrored", "came y is mirrored$"),
+        ("Nanonis", "swapped", "came x and y are swapped$"),
+        ("Nanosurf", "scale", r"scale is wrong along x: a move of 1 shows as 0.9\d; .* along y: .* as 0.9\d$"),
+        ("Nanonis", "scale of y", r"came the scale is wrong along y: a move of 1 shows as 1.1\d$"),
+        ("Nanosurf", "angle", r"came the angle is wrong: the picture is turned by \+[45]\.\d deg from x, "),
+        ("Nanonis", "other way", r"came the angle is wrong: a frame turned by 20 deg is turned by -(19|20)\.\d deg$"),
+    ],
+)
+def test_frame_that_is_moved_alone_shows_its_fault(
+    vendor: str, fault: str, said: str, tmp_path: Path, spoiled: None
+) -> None:
+    emulator, controller = f"spoiled.Wrong{vendor}", f'fault = "{fault}"\n'
+    result = commissioned(tmp_path, emulator, Person(), vendor, controller=controller, only="moved-frame", frame_m=8e-7)
+    found = result.progress.results["moved-frame"]
+    assert found.outcome is CheckOutcome.FAILED, found
+    assert re.search(said, found.line), found.line
+    assert InstrumentReport.read(tmp_path / "report.toml").steps["moved-frame"]["line"] == found.line
+    assert list(result.progress.results) == ["controller", "contact", "moved-frame"]
+
+
+def test_step_that_does_not_exist_is_refused_with_the_names_of_all(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"there is no step 'frames'.*moved-frame"):
+        commissioned(tmp_path, "Nanonis", Person(), only="frames")

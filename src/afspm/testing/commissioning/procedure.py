@@ -19,7 +19,7 @@ from afspm.testing.commissioning.guide import Guide, Prompts
 from afspm.testing.commissioning.maker_claims import MakerClaim
 from afspm.testing.commissioning.progress import CommissioningProgress
 from afspm.testing.commissioning.report import InstrumentReport, steps_of
-from afspm.testing.commissioning.steps import WITHDRAWN, Reopened, all_steps
+from afspm.testing.commissioning.steps import WITHDRAWN, Reopened, all_steps, alone
 from afspm.testing.conformance import CheckOutcome, CheckResult, Failed, Lost, Skipped, attempt, counted, mark
 from afspm.testing.translators.client import value_in
 from afspm.testing.translators.report import CheckReport
@@ -66,6 +66,7 @@ def commission(
     before: InstrumentReport | None = None,
     *,
     has_panel: bool | None = None,
+    only: str = "",
 ) -> CommissioningResult:
     """Guide a person through all steps.
 
@@ -73,13 +74,15 @@ def commission(
         file: file for the report, written after each step.
         tried_on: see `TRIED_ON`.
         before: the report of an unfinished commissioning of the same controller, to continue.
+        only: the name of a step to run alone, with the questions that it needs; empty: all steps.
         has_panel: False skips questions about the panel; None: a simulated microscope has no panel.
 
     Raises:
         ConfigError: the experiment file is wrong; nothing was started.
         KeyboardInterrupt: the scan was stopped, the tip withdrawn if it was in contact, and all settings restored.
     """
-    result = CommissioningResult(CommissioningProgress.resumed(all_steps(), before.results() if before else {}), file)
+    steps = alone(only) if only else all_steps()
+    result = CommissioningResult(CommissioningProgress.resumed(steps, before.results() if before else {}), file)
     result.claims = dict(before.claims) if before else {}
     for is_again in (False, True):
         try:
@@ -169,7 +172,8 @@ class _Walk:
                 self._guide.prompts.show(f"  {line}")
             self._settle(step.name)
             self._write()
-            if step.contact or result.outcome is not CheckOutcome.PASSED:
+            following = self._progress.next()
+            if following is None or not following.contact:
                 self.withdraw()
 
     def _settle(self, step: str) -> None:

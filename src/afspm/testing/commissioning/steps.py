@@ -7,24 +7,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
+from afspm.basics.errors import ConfigError
 from afspm.basics.formatting import quantity
 from afspm.basics.units import same_kind
 from afspm.drawing import raster
 from afspm.model import ChannelRoles, ControlRequest, Feedback, RegionChange, Scan, ScanParameters, ScopeState, names
+from afspm.model.arrays import Array
 from afspm.model.requests import Parameter
-from afspm.testing.commissioning import lines_in_scan
+from afspm.testing.commissioning import lines_in_scan, moved_frame
 from afspm.testing.commissioning.guide import Guide
 from afspm.testing.commissioning.progress import CommissioningStep
-from afspm.testing.conformance import Declined, Lost, Skipped, expect
+from afspm.testing.conformance import Declined, Failed, Lost, Skipped, expect
 from afspm.testing.translators.checks import frames, picture, scans
 from afspm.testing.translators.client import describe_all
 from afspm.testing.translators.client import scans as published
-from afspm.testing.translators.measuring import SCAN_S, STOPPED_REAL_S, FrameSetting, Taken, number
+from afspm.testing.translators.measuring import SCAN_S, STOPPED_REAL_S, TURN_RAD, FrameSetting, Taken, number
 
 READ, FRAME, ANGLE, SCAN, END, FILES, STOP, LOSS, AXES = (
     "read", "frame", "angle", "scan", "end of a scan", "files", "stop", "lost connection", "axes",
@@ -46,6 +49,20 @@ _FRAME = (names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
 
 class Reopened(Lost):
     """The exception that the person has withdrawn the tip at the panel, as asked: a new run has to go on."""
+
+
+def alone(name: str) -> tuple[CommissioningStep, ...]:
+    """Return one step, with the questions about the controller and the tip that precede it.
+
+    Raises:
+        ConfigError: there is no such step.
+    """
+    wanted = next((step for step in _STEPS if step.name == name), None)
+    if wanted is None:
+        raise ConfigError(f"there is no step {name!r}", hint=f"one of {', '.join(step.name for step in _STEPS)}")
+    gate = "contact" if wanted.contact else "withdrawn"
+    after = {"controller": (), gate: ("controller",), name: (gate,)} if wanted.moves else {name: ()}
+    return tuple(replace(step, after=after[step.name]) for step in _STEPS if step.name in after)
 
 
 def all_steps() -> tuple[CommissioningStep, ...]:
@@ -473,11 +490,68 @@ def _contact(guide: Guide) -> str:
     return _agreed(guide, at_sample=True)
 
 
+_OFFSETS: Final = ((-0.1, -0.1), (0.1, -0.1), (-0.1, 0.1))
+"""Centres of the frames that are compared, as fractions of the whole frame: one, moved along x, moved along y."""
+_PART, _PIXELS, _TURN_DEG = (0.5, 0.5), (64, 64), math.degrees(TURN_RAD)
+
+
+@_step(
+    "Moving the frame",
+    "afspm takes six scans: one, one moved along x, one moved along y, the first again, and two of a turned frame, and "
+    "compares how far and where to the picture moves.",
+    "Do not use positions of this controller: the report names the fault. Compare the scanner's calibration of the "
+    "offset and of the scan range at the panel, and the angle; report it with the trace of this run.",
+    after=("contact",),
+    contact=True,
+    operations=(AXES,),
+    needs=(names.START_SCAN, *_FRAME),
+)
+def _moved_frame(guide: Guide) -> str:
+    kit = guide.kit
+    upright = [kit.frames.part(offset, _PART, _PIXELS) for offset in (*_OFFSETS, _OFFSETS[0])]
+    x, y = 0.1 * math.cos(TURN_RAD), 0.1 * math.sin(TURN_RAD)
+    turned = [kit.frames.part(sign, _PART, _PIXELS, TURN_RAD) for sign in ((-x, -y), (x, y))]
+    taken = [kit.take_scan(one).scans for one in (*upright, *(turned if kit.support.has(names.SCAN_ANGLE) else ()))]
+    (x_move, y_move, drift), *of_turned = _moves(taken)
+    found = moved_frame.faults(x_move, y_move, of_turned[0][0] if of_turned else None, _TURN_DEG)
+    if found:
+        failure = Failed("a picture that moves as its frame does", "; ".join(found))
+        kit.excuse("scan/picture", failure)
+        raise failure
+    lengths = " and ".join(f"{np.hypot(*one):.3f}" for one in (x_move, y_move))
+    return f"moves of 1 show as {lengths} along x and y; drift of {np.hypot(*drift):.3f} moves in three scans"
+
+
+def _moves(taken: list[list[Scan]]) -> list[list[Array]]:
+    # the moves of the upright pictures and of the turned ones, in units of the frame's, of the channel that shows best
+    groups = [taken[:4], taken[4:]] if taken[4:] else [taken]
+    seen = [
+        [[moved_frame.displacement(group[0][i].values, one[i].values) for one in group[1:]] for group in groups]
+        for i in range(min(map(len, taken)))
+        if len({one[i].channel for one in taken}) == 1 and all(one[i].shape == _PIXELS for one in taken)
+    ]
+    expect(seen, "the same channels in all scans", "no channel that all have")
+    best = max(seen, key=lambda channel: min(one.likeness for group in channel for one in group))
+    for one in (one for group in best for one in group):
+        if one.likeness < moved_frame.LIKE:
+            raise Skipped(f"no structure is seen in all scans (correlation {one.likeness:.2f}): noise shows no move")
+        if one.is_ambiguous:
+            raise Skipped("the structure repeats, so that several moves fit: choose a place without a lattice")
+    unit_px = 0.2 / 0.5 * (np.array(_PIXELS[::-1]) - 1.0)
+    drift = best[0][2].move / unit_px
+    upright = [one.move / unit_px - drift * part for one, part in zip(best[0], (1 / 3, 2 / 3, 0), strict=True)]
+    cos, sin = math.cos(TURN_RAD), math.sin(TURN_RAD)
+    turned = [
+        [one.move / unit_px - np.array([[cos, sin], [-sin, cos]]) @ drift / 3 for one in group] for group in best[1:]
+    ]
+    return [upright, *turned]
+
+
 @_step(
     "Axes and angles",
     "afspm takes a larger scan and details of it, one turned, and fits the details into it. Then compare the picture.",
     "Do not use what was measured: axes or angles are wrong. Report it with the trace of this run.",
-    after=("contact",),
+    after=("contact", "moved-frame"),
     contact=True,
     operations=(AXES,),
     needs=(names.START_SCAN,),

@@ -59,27 +59,27 @@ class FrameSettings:
     @property
     def plain(self) -> FrameSetting:
         """A square, off-centre in both directions."""
-        return self._part((0.1, -0.15), (0.5, 0.5), (32, 32))
+        return self.part((0.1, -0.15), (0.5, 0.5), (32, 32))
 
     @property
     def other(self) -> FrameSetting:
         """A smaller square at another position."""
-        return self._part((-0.2, 0.2), (0.3, 0.3), (32, 32))
+        return self.part((-0.2, 0.2), (0.3, 0.3), (32, 32))
 
     @property
     def wide(self) -> FrameSetting:
         """A frame twice as wide as high, with another pixel count and pixels twice as high as wide."""
-        return self._part((-0.1, 0.15), (0.6, 0.3), (16, 64))
+        return self.part((-0.1, 0.15), (0.6, 0.3), (16, 64))
 
     @property
     def turned(self) -> FrameSetting:
         """A frame rotated counter-clockwise, with square pixels: some scanners have no others."""
-        return self._part((0.1, 0.05), (0.5, 0.5 * 31 / 47), (32, 48), TURN_RAD)
+        return self.part((0.1, 0.05), (0.5, 0.5 * 31 / 47), (32, 48), TURN_RAD)
 
-    def _part(
+    def part(
         self, offset: tuple[float, float], size: tuple[float, float], shape: tuple[int, int], turn_rad: float = 0.0
     ) -> FrameSetting:
-        # `offset` of the centre and `size` are fractions of the whole frame, along its own axes
+        """Return a part of the whole frame; `offset` of the centre and `size` are its fractions, along its own axes."""
         width, height = self.whole.size_m
         side = min(width, height)
         cos, sin = math.cos(self.whole.angle_rad), math.sin(self.whole.angle_rad)
@@ -212,9 +212,13 @@ class CheckMeasurements:
         Raises:
             Skipped: the controller cannot pass the check.
         """
-        if check.name in self._excused:
-            raise Skipped(f"{self._excused[check.name]}: {failure}")
+        self.excuse(check.name, failure)
         return tuple(self._complaints[self._heeded :])
+
+    def excuse(self, name: str, failure: Failed) -> None:
+        """Raise Skipped if the controller cannot pass the check of this name."""
+        if name in self._excused:
+            raise Skipped(f"{self._excused[name]}: {failure}")
 
     def can_pass(self, name: str) -> bool:
         """Return whether the controller is able to pass the check of this name."""
