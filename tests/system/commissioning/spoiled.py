@@ -11,6 +11,7 @@ import numpy as np
 from afspm.basics import FileError, entry_points
 from afspm.driver import Driver
 from afspm.model import Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
+from afspm.plugins.gxsm.emulator import GxsmEmulator
 from afspm.plugins.nanonis import Nanonis
 from afspm.plugins.nanonis.emulator import NanonisEmulator
 from afspm.plugins.nanosurf.emulator import NanosurfEmulator
@@ -134,3 +135,16 @@ class WrongNanonisEmulator(WrongScanner, NanonisEmulator):
 
 class WrongNanosurfEmulator(WrongScanner, NanosurfEmulator):
     """The emulated Nanosurf with such a scanner."""
+
+
+class SimulatingGxsmEmulator(GxsmEmulator):
+    """GXSM's own simulator, without a scan-speed; its picture turns the other way."""
+
+    def __init__(self, *, pixels_per_s: float, **settings: Any) -> None:
+        super().__init__(card="simulator", **settings)
+        self.pixels_per_s = pixels_per_s
+
+    def open(self) -> str:
+        address = super().open()
+        self.program.entries.put("sim-stm-speed", self.pixels_per_s)
+        return address

@@ -37,6 +37,7 @@ from afspm.testing.commissioning.report import InstrumentReport
 from afspm.testing.conformance import CheckOutcome
 from afspm.testing.translators import CheckOptions
 from afspm.testing.translators.checks import scans
+from afspm.testing.translators.measuring import STOPPED_REAL_S
 from afspm.translator.trace import FILE, TracedExchange, read_trace
 
 HERE = Path(__file__).parent
@@ -541,6 +542,26 @@ def test_tip_withdrawn_at_the_panel_when_the_step_asks_for_it_lets_the_evening_g
     assert result.progress.results["scan"].outcome is CheckOutcome.PASSED
     assert sum("Is this the controller in front" in line for line in person.shown) == 1, "no passed step is repeated"
     assert not any("not put back" in line for line in person.shown)
+
+
+# makers Z3
+@pytest.mark.parametrize("step", ["axes", "moved-frame"])
+def test_simulator_of_gxsm_is_excused_its_picture(step: str, tmp_path: Path, spoiled: None) -> None:
+    fast = "pixels_per_s = 1000\n"
+    gxsm = "spoiled.SimulatingGxsm"
+    result = commissioned(tmp_path, gxsm, Person(), "Gxsm", controller=fast, only=step)
+    found = result.progress.results[step]
+    assert found.outcome is CheckOutcome.SKIPPED, found
+    assert found.line.startswith("GXSM's simulator turns its picture against the direction")
+
+
+# makers Z4
+def test_scan_to_be_stopped_at_the_panel_is_long_without_a_scan_speed(tmp_path: Path, spoiled: None) -> None:
+    person = Person()
+    emulator = "spoiled.SimulatingGxsm"
+    commissioned(tmp_path, emulator, person, "Gxsm", controller="pixels_per_s = 80\n", only="stop-at-panel")
+    (lasts,) = filter(None, (re.search(r"The scan lasts about (\d+) s", line) for line in person.shown))
+    assert int(lasts[1]) >= STOPPED_REAL_S
 
 
 # users U15

@@ -418,7 +418,10 @@ def _stop(guide: Guide) -> str:
 )
 def _stop_at_panel(guide: Guide) -> str:
     client = guide.kit.client
-    mark, _ = guide.kit.begin_long_scan(guide.kit.frames.other, STOPPED_REAL_S)  # a person needs time to click
+    # a person needs time to click
+    mark, lasts_s = guide.kit.begin_long_scan(guide.kit.frames.other, STOPPED_REAL_S)
+    lasts = "an unknown time: be quick" if lasts_s is None else f"about {client.clock.real_s(lasts_s):.0f} s"
+    guide.prompts.show(f"  The scan lasts {lasts}.")
     reply = guide.prompts.text("Stop the scan at the panel, then press Enter (u: it can't be stopped there)")
     if reply.strip():
         client.come_to_rest()
@@ -558,7 +561,11 @@ def _moves(taken: list[list[Scan]]) -> list[list[Array]]:
 )
 def _axes(guide: Guide) -> str:
     guide.kit.forget()  # those measurements were taken with the tip withdrawn
-    picture.picture(guide.kit)
+    try:
+        picture.picture(guide.kit)
+    except Failed as failure:
+        guide.kit.excuse("scan/picture", failure)
+        raise
     taken = guide.kit.scan("wide" if guide.kit.can_pass("scan/not-square") else "plain").scans
     scan = next((one for one in taken if one.unit == "m"), taken[0])
     file = guide.folder / "commissioning.png"

@@ -122,7 +122,15 @@ STOPPED_REAL_S = 40.0
 UNKNOWN_S = 1200.0
 """Experiment seconds after which a scan or spectrum of unknown duration counts as endless."""
 
+MOST_ROWS = 1024
+"""Most lines of a scan whose duration only its lines can set."""
+
 T = TypeVar("T")
+
+
+def longest_rows(lasts_s: float, line_s: float) -> int:
+    """Return the number of lines of a scan of `lasts_s`: a multiple of 16, up to `MOST_ROWS`."""
+    return min(MOST_ROWS, 16 * math.ceil(lasts_s / max(line_s, 1e-3) / 16.0))
 
 
 @dataclass(frozen=True)
@@ -253,9 +261,21 @@ class CheckMeasurements:
         return Taken(frame, observed, expected_s)
 
     def begin_long_scan(self, frame: FrameSetting, lasts_real_s: float = 0.0) -> tuple[int, float | None]:
-        """Start a scan long enough for other requests; return the mark before it, and its duration as `prepare`."""
+        """Start a scan long enough for other requests; return the mark before it, and its expected duration.
+
+        Without a scan speed it gets more lines: as many as the time of a line in the scan of the plain frame asks for.
+        """
         lasts_real_s = max(LONG_REAL_S * self.client.patience, lasts_real_s)
-        expected_s = self.prepare(frame, max(SCAN_S, lasts_real_s / self.client.clock.real_s(1.0)))
+        lasts_s = max(SCAN_S, lasts_real_s / self.client.clock.real_s(1.0))
+        if self.support.parameters.get(names.SCAN_SPEED) is None:
+            plain = self.scan("plain")
+            line_s = (plain.time_s(ScopeState.FREE) - plain.time_s(ScopeState.SCANNING)) / self.frames.plain.shape[0]
+            rows = longest_rows(lasts_s, line_s)
+            square = not self.can_pass("scan/not-square")
+            frame = replace(frame, shape=(rows, rows if square else frame.shape[1]))
+            self.prepare(frame, lasts_s)
+            return self._begin(names.START_SCAN, ScopeState.SCANNING), rows * line_s
+        expected_s = self.prepare(frame, lasts_s)
         return self._begin(names.START_SCAN, ScopeState.SCANNING), expected_s
 
     def prepare(self, frame: FrameSetting, lasts_s: float) -> float | None:
