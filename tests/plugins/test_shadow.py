@@ -193,7 +193,7 @@ def test_shadow_sends_questions_only_over_a_night_of_a_person(
 
 
 @each
-def test_contact_reads_what_is_in_force_and_sends_questions_only(watched: Watched, beside: Make) -> None:
+def test_contact_reads_the_settings_and_sends_questions_only(watched: Watched, beside: Make) -> None:
     night = beside(shadow_of(watched))
     found = contact(resolve_name(shadow_of(watched))(address=night.address, **night.settings))
     assert found.lost is None

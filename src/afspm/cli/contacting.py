@@ -39,7 +39,7 @@ def asked(kind: type[DriverBase], settings: Mapping[str, object]) -> tuple[str, 
     """Ask a controller by the shadow of its driver.
 
     Returns:
-        the address; what the controller told, or None with the reason why it was not asked.
+        the address; the answers, or None with the reason why the controller was not asked.
     """
     if not kind.shadow:
         what = f"{kind.__name__} has no shadow, a driver that only reads: its controller is not asked"

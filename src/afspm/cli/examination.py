@@ -71,7 +71,7 @@ def examine(
 ) -> Examination:
     """Examine an experiment from this computer, and count its scheduler's packets for `listen_s` of real time.
 
-    A real controller is asked what is in force there. Without an experiment, or with errors in its file, only this
+    A real controller is asked for its settings. Without an experiment, or with errors in its file, only this
     computer is examined.
 
     Args:
@@ -95,7 +95,7 @@ def show(found: Collection[Diagnosis], *, everything: bool = True) -> None:
     """Print diagnoses, the faults last, where one looks.
 
     Args:
-        everything: whether to print what the packages offer, which tells nothing of an experiment.
+        everything: whether to print the offers of all packages, which do not depend on an experiment.
     """
     console = Console(highlight=False)
     for one in sorted(found, key=lambda one: list(Severity).index(one.severity)):
@@ -126,7 +126,7 @@ def _file(experiment: Experiment) -> Iterator[Diagnosis]:
 def controller(
     kind: type[DriverBase] | None, settings: Mapping[str, object], *, everything: bool = False
 ) -> list[Diagnosis]:
-    """Return what a controller tells; nothing without a driver."""
+    """Return the diagnoses of a controller; none without a driver."""
     if kind is None:
         return []
     at, contact, why_not = contacting.asked(kind, settings)

@@ -308,9 +308,9 @@ def doctor(
 ) -> None:
     """Find the faults of an experiment, seen from this computer, with remedies.
 
-    A real controller is asked what is in force: its release, range, preamplifier, bias, setpoint … Questions are all
+    A real controller is asked for its release, range, preamplifier, bias, setpoint … Questions are all
     that is sent to it. Checks names, ports, keys, clocks, versions, disk and memory, and the packets of the scheduler.
-    Works before the experiment runs, while it runs, and when a part of it does not. Tells why a driver, component,
+    Works before the experiment runs, while it runs, and when a part of it does not. Shows why a driver, component,
     reader … of an installed package can't be loaded. Without a file only this computer is checked. Ends with 1 if
     something keeps the experiment from working.
     """

@@ -1,4 +1,4 @@
-"""The file of an instrument, from what its controller told: to be laid over any experiment."""
+"""The file of an instrument, from the answers of its controller: to be laid over any experiment."""
 
 from __future__ import annotations
 

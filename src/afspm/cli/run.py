@@ -139,7 +139,7 @@ def run(
 
 
 def _require_limits(experiment: Experiment, only: Collection[str], without: Collection[str]) -> None:
-    # at a real controller a person has said what is allowed, or says that nothing is forbidden
+    # a person has set limits for a real controller, or wants none
     import sys
 
     from afspm.cli import contacting

@@ -1,4 +1,4 @@
-"""A first contact with a controller: who answers, and what is in force there, by questions alone.
+"""A first contact with a controller: who answers, and with which settings, by questions alone.
 
 The driver is a maker's shadow (`translator.shadow`): it has no function that sets or starts anything, and its link
 sends nothing but questions.
@@ -47,10 +47,10 @@ class ParameterReading:
 
 @dataclass
 class Contact:
-    """What a controller has told of itself.
+    """The answers of a controller.
 
     Attributes:
-        said: what the driver logged while it connected: the release, the preamplifier, what is missing; with levels.
+        said: the log lines of the driver, with their levels: the release, the preamplifier, missing modules.
         connected_s: the real time until the driver was connected; None: it could not be, see `lost`.
         lost: why the controller did not answer, or no longer.
         status: its state; None: unknown.
@@ -89,7 +89,7 @@ def contact(driver: DriverBase) -> Contact:
     """
     assert driver.only_reads
     found, clock = Contact(), ExperimentClock.real()
-    log = logging.Logger("contact", logging.INFO)  # without parents: a person reads `said` alone
+    log = logging.Logger("contact", logging.INFO)  # without parents: the lines are shown by the caller
     log.addHandler(_Kept(found.said))
     memory: Plain = {}
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
@@ -133,6 +133,6 @@ def _asked(driver: DriverBase, name: str, row: ParameterSpec, clock: ExperimentC
         fault = ""
     except LOST:
         raise
-    except Exception as error:  # of a driver, which may raise anything: what can't be read is told
+    except Exception as error:  # of a driver, which may raise anything: the fault is shown
         value, fault = None, str(error)
     return ParameterReading(row, value, clock.monotonic_s() - began_s, fault)

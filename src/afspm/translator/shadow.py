@@ -50,7 +50,7 @@ _NOT_SENT = "not sent, since a shadow only reads the controller"
 
 
 def is_refusal(text: str) -> bool:
-    """Return whether a reason is that of `refusal`."""
+    """Return whether a reason comes from `refusal`."""
     return text.endswith(_NOT_SENT)
 
 

@@ -80,7 +80,7 @@ def test_controller_is_asked_written_down_and_run_with_what_was_read(tmp_path: P
     assert code == 0, text
 
 
-def test_silent_and_missing_controllers_are_told_with_a_remedy(tmp_path: Path) -> None:
+def test_silent_and_missing_controllers_are_faults_with_a_remedy(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         taken = silent.getsockname()[1]
         code, text = told(tmp_path, "doctor", "--on", "nanonis", "--at", f"127.0.0.1:{taken}")

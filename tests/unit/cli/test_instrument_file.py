@@ -43,7 +43,7 @@ def test_current_setpoint_stays_within_the_preamplifiers_reach(
     assert (found["min"], found["max"]) == bounds
 
 
-def test_bias_has_a_volt_to_each_side_or_twice_what_is_in_force() -> None:
+def test_bias_has_a_volt_to_each_side_or_twice_the_present_one() -> None:
     assert limits(bias=0.0)["tip-bias-voltage"]["max"] == "1 V"
     assert limits(bias=-8.0)["tip-bias-voltage"] == {"min": "-16 V", "max": "16 V", "step": "16 V"}
 
