@@ -69,7 +69,7 @@ def told(found: Contact, at: str, *, everything: bool = False) -> Iterator[Diagn
     if found.connected_s is not None:
         state = "" if found.status is None else f"; its state is {found.status.state.name}"
         yield diagnosis.fine("controller", at, f"answers, after {found.connected_s:.2g} s{state}")
-    for level, text in found.said:
+    for level, text in found.logged:
         severity = Severity.FINE if level < logging.WARNING else Severity.WARNING
         what, _, remedy = text.partition("; ")
         yield Diagnosis("controller", severity, at, what, remedy)

@@ -31,7 +31,7 @@ def text_of(class_name: str, settings: Mapping[str, str], channels: ChannelRoles
         settings: of the translator, such as its address.
         day: on which the controller was asked.
     """
-    head = next((text for _, text in found.said), class_name)
+    head = next((text for _, text in found.logged), class_name)
     lines = [
         f"# {head}: read on {day}. To be laid over any experiment: afspm run EXPERIMENT.toml THIS.toml",
         "# Each limit is a proposal from what was in force then: change it to what you allow.",

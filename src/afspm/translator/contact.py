@@ -50,7 +50,7 @@ class Contact:
     """The answers of a controller.
 
     Attributes:
-        said: the log lines of the driver, with their levels: the release, the preamplifier, missing modules.
+        logged: the log lines of the driver, with their levels: the release, the preamplifier, missing modules.
         connected_s: the real time until the driver was connected; None: it could not be, see `lost`.
         lost: why the controller did not answer, or no longer.
         status: its state; None: unknown.
@@ -60,7 +60,7 @@ class Contact:
         most_setpoint: the largest setpoint that the preamplifier reaches, if five times the one in force is beyond it.
     """
 
-    said: list[tuple[int, str]] = field(default_factory=list)
+    logged: list[tuple[int, str]] = field(default_factory=list)
     connected_s: float | None = None
     lost: Exception | None = None
     identity: str = ""
@@ -72,9 +72,9 @@ class Contact:
 
 
 class _Kept(logging.Handler):
-    def __init__(self, said: list[tuple[int, str]]) -> None:
+    def __init__(self, logged: list[tuple[int, str]]) -> None:
         super().__init__(logging.INFO)
-        self._said = said
+        self._said = logged
 
     def emit(self, record: logging.LogRecord) -> None:
         if (one := (record.levelno, record.getMessage())) not in self._said:
@@ -90,7 +90,7 @@ def contact(driver: DriverBase) -> Contact:
     assert driver.only_reads
     found, clock = Contact(), ExperimentClock.real()
     log = logging.Logger("contact", logging.INFO)  # without parents: the lines are shown by the caller
-    log.addHandler(_Kept(found.said))
+    log.addHandler(_Kept(found.logged))
     memory: Plain = {}
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         driver.clock, driver.log, driver.run_dir, driver.memory = clock, log, Path(folder), memory
