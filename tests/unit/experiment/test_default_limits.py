@@ -113,7 +113,7 @@ def test_rule_is_dropped_by_its_name(staged: Write) -> None:
 def test_each_limit_has_a_default_that_a_file_may_tighten() -> None:
     assert {one.name for one in fields(Limit)} == {*bounds(Limit), "unit", "source", "unseen_sweeps"}
     of_experiment = bounds(ExperimentLimits)
-    assert LimitsSection.model_fields.keys() == {*map(limit_key, of_experiment), "loosen"}
+    assert LimitsSection.model_fields.keys() == {*map(limit_key, of_experiment), "loosen", "none"}
     places, merged_by_name = (f"{name}_source" for name in of_experiment), ("parameters", "actions", "forbid")
     of_file_alone = ("sets", "roles", "bias", "movers")
     assert {one.name for one in fields(ExperimentLimits)} == {

@@ -757,7 +757,15 @@ def test_a_request_that_was_done_before_the_controller_was_lost_stays_a_success(
     assert bench.ask(POSITION, ProbePosition((1e-6, 0.0)), request_id="one").code == OK
 
 
-@pytest.mark.parametrize(("vendor", "value"), [("X", math.nan), ("P", math.inf), ("Loop", math.nan), ("W", "wide")])
+def test_impossible_gain_is_left_out_and_the_controller_kept(bench: Any) -> None:
+    bench.microscope.values["P"] = math.inf
+    bench.look()
+    ((name, feedback, _),) = bench.port.packets
+    assert (name, feedback.proportional_gain) == ("ZCtrlParameters", None)
+    assert feedback.on is not None
+
+
+@pytest.mark.parametrize(("vendor", "value"), [("X", math.nan), ("Loop", math.nan), ("W", "wide")])
 def test_impossible_value_is_never_published(bench: Any, vendor: str, value: Any) -> None:
     bench.microscope.values[vendor] = value
     bench.look()
