@@ -149,19 +149,12 @@ def _merge(
 ) -> None:
     for key, value in above.items():
         here = (*path, key)
-        if not isinstance(value, dict):
-            below_it = None
-        elif value.get(REPLACES) is True:
-            below_it, value = None, {name: one for name, one in value.items() if name != REPLACES}
-        else:
-            below_it = below.get(key)
-        if isinstance(below_it, dict):
-            _merge(below_it, value, here, places)
+        if path and key == REPLACES and value is True:
             continue
-        for old in [p for p in places if p[: len(here)] == here]:
-            del places[old]  # the value there is replaced as a whole
-        if isinstance(value, dict):
-            below[key] = {}
+        is_table = isinstance(value, dict)
+        if not is_table or value.get(REPLACES) is True or not isinstance(below.get(key), dict):
+            for old in [p for p in places if p[: len(here)] == here]:
+                del places[old]  # the value there is replaced as a whole
+            below[key] = {} if is_table else copy.deepcopy(value)
+        if is_table:
             _merge(below[key], value, here, places)
-        else:
-            below[key] = copy.deepcopy(value)
