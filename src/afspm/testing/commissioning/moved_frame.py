@@ -14,6 +14,7 @@ import numpy as np
 from scipy.signal import correlate
 
 from afspm.model.arrays import Array
+from afspm.model.line_levelling import Levelling, levelled
 
 LIKE: Final = 0.6
 """Least correlation of two pictures that show the same structure."""
@@ -42,7 +43,7 @@ class Displacement:
 
 def displacement(before: Array, after: Array) -> Displacement:
     """Return the move of the frame between two pictures of the same shape, [y, x] with y upwards."""
-    a, b = _level(before), _level(after)
+    a, b = (levelled(one, Levelling.PLANE) for one in (before, after))
     one = np.ones_like(a)
     count = np.maximum(correlate(one, one, method="fft"), 1.0)
     sum_a, sum_b = correlate(a, one, method="fft"), correlate(one, b, method="fft")
@@ -67,13 +68,6 @@ def _peak(values: Array, at: int) -> float:
     low, top, high = values[at - 1 : at + 2]
     curve = low - 2.0 * top + high
     return at + float(0.5 * (low - high) / curve) if curve < 0.0 else float(at)
-
-
-def _level(values: Array) -> Array:
-    rows, columns = np.indices(values.shape)
-    plane = np.stack([rows.ravel(), columns.ravel(), np.ones(values.size)], axis=1).astype(float)
-    flat = values.ravel()
-    return np.asarray((flat - plane @ np.linalg.lstsq(plane, flat, rcond=None)[0]).reshape(values.shape))
 
 
 def faults(along_x: Array, along_y: Array, turned: Array | None, turned_deg: float = 0.0) -> list[str]:
