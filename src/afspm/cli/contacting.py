@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 
-from afspm.basics import entry_points
-from afspm.basics.errors import AfspmError, ConfigError
+from afspm.basics.errors import AfspmError
 from afspm.basics.formatting import quantity
 from afspm.experiment import class_loader
-from afspm.experiment.findings import nearest
 from afspm.model import names
 from afspm.translator.contact import Contact, contact
 from afspm.translator.controller_lock import ControllerTaken, commanding
@@ -26,35 +24,32 @@ SHOWN = (
 """The parameters that a person compares with the panel; `--all` shows all of them."""
 
 
-def driver_of(maker: str) -> type[DriverBase]:
-    """Return the driver of a maker by its short name, in any case. Raises ConfigError."""
-    drivers = {name.lower(): name for name in entry_points.names(entry_points.DRIVERS)}
-    if maker.lower() not in drivers:
-        raise ConfigError(f"there is no driver {maker!r}", where="--on", hint=nearest(maker.lower(), drivers))
-    driver: type[DriverBase] = entry_points.load(entry_points.DRIVERS, drivers[maker.lower()])
-    return driver
-
-
-def asked(kind: type[DriverBase], settings: Mapping[str, object]) -> tuple[str, Contact | None, Sequence[Diagnosis]]:
+def asked(
+    kind: type[DriverBase], settings: Mapping[str, object], *, everything: bool = False
+) -> tuple[Contact | None, list[Diagnosis]]:
     """Ask a controller by the shadow of its driver.
 
+    Args:
+        everything: whether there is a diagnosis of each parameter.
+
     Returns:
-        the address; the answers, or None with the reason why the controller was not asked.
+        the answers, None if the controller was not asked; the diagnoses, with the reason then.
     """
     if not kind.shadow:
         what = f"{kind.__name__} has no shadow, a driver that only reads: its controller is not asked"
-        return "", None, [Diagnosis("controller", Severity.WARNING, kind.__name__, what, "see docs/how-to/shadow.md")]
+        return None, [Diagnosis("controller", Severity.WARNING, kind.__name__, what, "see docs/how-to/shadow.md")]
     try:
         driver = class_loader.load(kind.shadow)(**settings)
     except AfspmError as error:
         what = f"its controller is not asked: {error.what}"
-        return "", None, [Diagnosis("controller", Severity.WARNING, kind.__name__, what, error.hint)]
+        return None, [Diagnosis("controller", Severity.WARNING, kind.__name__, what, error.hint)]
     at = driver.controller_at
     try:
         with commanding(at, "afspm doctor"):
-            return at, contact(driver), ()
+            found = contact(driver)
     except ControllerTaken as taken:
-        return at, None, [diagnosis.fine("controller", at, f"it is not asked: {taken.what}")]
+        return None, [diagnosis.fine("controller", at, f"it is not asked: {taken.what}")]
+    return found, [*told(found, everything=everything)]
 
 
 def text_of(row: ParameterSpec, value: Value) -> str:
@@ -64,8 +59,9 @@ def text_of(row: ParameterSpec, value: Value) -> str:
     return quantity(value, row.si_unit) if isinstance(value, float) and row.si_unit else row.quantity(value)
 
 
-def told(found: Contact, at: str, *, everything: bool = False) -> Iterator[Diagnosis]:
+def told(found: Contact, *, everything: bool = False) -> Iterator[Diagnosis]:
     """Yield a line for each answer, and each fault with its remedy."""
+    at = found.address
     if found.connected_s is not None:
         state = "" if found.status is None else f"; its state is {found.status.state.name}"
         yield diagnosis.fine("controller", at, f"answers, after {found.connected_s:.2g} s{state}")

@@ -344,18 +344,18 @@ def instrument(
 
     from afspm.basics.errors import ConfigError
     from afspm.cli import contacting, examination, instrument_file
+    from afspm.experiment.shadow import driver_of
 
     if out.exists():
         raise ConfigError("the file is there already", where=str(out), hint="name another with --out")
-    driver = contacting.driver_of(maker)
+    name, driver = driver_of(maker)
     settings = {"address": address} if address else {}
-    at, found, why_not = contacting.asked(driver, settings)
-    told = [*why_not, *(contacting.told(found, at) if found is not None else ())]
+    found, told = contacting.asked(driver, settings)
     examination.show(told)
     if found is None or found.lost is not None:
         raise typer.Exit(1)
     day = dt.datetime.now(dt.UTC).date().isoformat()
-    text = instrument_file.text_of(driver.__name__, {"address": at}, driver.channels_of(settings), found, day)
+    text = instrument_file.text_of(name, driver.channels_of(settings), found, day)
     out.write_text(text, encoding="utf-8")
     typer.echo(f"{out}: look through its limits; then try it with: afspm check EXPERIMENT.toml {out}")
 

@@ -31,7 +31,6 @@ from afspm.model import CLOCK_REQUEST, ProcessCondition, ProcessStates, Request
 from afspm.model.events import SUPERVISOR
 from afspm.record import goes_on
 from afspm.supervisor.reporter import computer_name
-from afspm.translator.driver_base import DriverBase
 from afspm.translator.trace import FILE as TRACE_FILE
 from afspm.translator.trace import load_of, newest_lines
 from afspm.transport import diagnosis, keys, probe
@@ -81,7 +80,9 @@ def examine(
     examination = Examination([] if experiment is None else [*_file(experiment)])
     examination.found += diagnosis.of_packages(entry_points.inventory(commands))
     if experiment is not None and diagnosis.is_well(examination.found):
-        examination.found += controller(*experiment.resolved.driver(), everything=everything)
+        kind, settings = experiment.resolved.driver()
+        if kind is not None:
+            examination.found += contacting.asked(kind, settings, everything=everything)[1]
         examination.found += _keys(experiment)
         _Connections(experiment, examination).examine(listen_s)
         examination.found += _devices(experiment)
@@ -121,16 +122,6 @@ def _file(experiment: Experiment) -> Iterator[Diagnosis]:
             for lost in experiment.resolved.lost_without():
                 what, _, hint = lost.partition("; ")
                 yield Diagnosis("withdrawal", Severity.WARNING, translator.name, what, hint)
-
-
-def controller(
-    kind: type[DriverBase] | None, settings: Mapping[str, object], *, everything: bool = False
-) -> list[Diagnosis]:
-    """Return the diagnoses of a controller; none without a driver."""
-    if kind is None:
-        return []
-    at, contact, why_not = contacting.asked(kind, settings)
-    return [*why_not, *(contacting.told(contact, at, everything=everything) if contact is not None else ())]
 
 
 def _keys(experiment: Experiment) -> Iterator[Diagnosis]:

@@ -314,15 +314,15 @@ def doctor(
     reader … of an installed package can't be loaded. Without a file only this computer is checked. Ends with 1 if
     something keeps the experiment from working.
     """
-    from afspm.cli import examination
-    from afspm.cli.contacting import driver_of
+    from afspm.cli import contacting, examination
     from afspm.experiment import load
+    from afspm.experiment.shadow import driver_of
 
     if (at and not on) or (on and files):
         raise typer.BadParameter("name a file, or a maker with --on and perhaps --at", param_hint="--on")
     if on:
         settings = {"address": at} if at else {}
-        examined = examination.Examination(examination.controller(driver_of(on), settings, everything=everything))
+        examined = examination.Examination(contacting.asked(driver_of(on)[1], settings, everything=everything)[1])
     else:
         experiment = load(*files) if files else None
         examined = examination.examine(experiment, runs, listen, _commands(context), everything=everything)

@@ -6,12 +6,15 @@ from collections.abc import Iterator, Mapping
 from typing import Final, NamedTuple
 
 from afspm.basics.formatting import quantity
+from afspm.experiment.toml_writer import value
 from afspm.model import ChannelRoles, names
 from afspm.model.variables import RETRACE
-from afspm.translator.contact import Contact, ParameterReading
+from afspm.translator.contact import MOST, Contact, ParameterReading
 
 _LEAST_BIAS_V: Final = 1.0
-_BIAS_FACTOR, _SETPOINT_FACTORS, _AMPLITUDE_FACTORS = 2.0, (0.1, 5.0), (0.5, 1.5)
+_BIAS_FACTOR: Final = 2.0
+_OF_CURRENT: Final = ((0.1, MOST), f"from a tenth to {MOST:g} times that")
+_OF_AMPLITUDE: Final = ((0.5, 1.5), "half of that to each side")
 _AXES: Final = {"x": ("x-scan-center-x", names.PROBE_POS_X), "y": ("x-scan-center-y", names.PROBE_POS_Y)}
 
 
@@ -24,14 +27,14 @@ class _Proposal(NamedTuple):
     why: str
 
 
-def text_of(class_name: str, settings: Mapping[str, str], channels: ChannelRoles, found: Contact, day: str) -> str:
+def text_of(class_name: str, channels: ChannelRoles, found: Contact, day: str) -> str:
     """Return the file, with the reason for each proposed limit.
 
     Args:
-        settings: of the translator, such as its address.
         day: on which the controller was asked.
     """
-    head = next((text for _, text in found.logged), class_name)
+    known = found.answers.get(names.CONTROLLER)
+    head = class_name if known is None or known.value is None else " ".join(str(known.value).split())
     lines = [
         f"# {head}: read on {day}. To be laid over any experiment: afspm run EXPERIMENT.toml THIS.toml",
         "# Each limit is a proposal from what was in force then: change it to what you allow.",
@@ -42,8 +45,8 @@ def text_of(class_name: str, settings: Mapping[str, str], channels: ChannelRoles
         "[microscope]",
         "replaces = true  # nothing stays of the simulated microscope of a sample",
         "component = true",
-        f'class = "{class_name}"',
-        *(f"{key} = {_toml(value)}" for key, value in settings.items()),
+        f"class = {value(class_name)}",
+        f"address = {value(found.address)}",
         '# channels by role, as the driver knows them; others are named so: channels = { height = "Z" }',
         *(f"#   {role}: {' or '.join(known)}" for role, known in channels.names.items() if RETRACE not in role),
         "",
@@ -53,7 +56,7 @@ def text_of(class_name: str, settings: Mapping[str, str], channels: ChannelRoles
     for one in (*_bias(found.answers), *_setpoint(found)):
         lines += ["", f"[limits.{one.name}]  # {one.why}"]
         bounds = {"min": one.low, "max": one.high, "step": one.step}
-        lines += [f"{key} = {_toml(_text(value, one.unit))}" for key, value in bounds.items()]
+        lines += [f"{key} = {value(_text(bound, one.unit))}" for key, bound in bounds.items()]
     return "\n".join(lines) + "\n"
 
 
@@ -64,44 +67,35 @@ def _region(found: Contact) -> Iterator[str]:
         if ends is None:
             yield "# region: the driver does not know the scanner's range: set one before the first scan"
             return
-        low, high = (_toml(_text(end, "m")) for end in ends)
-        sides.append(f"{axis} = [{low}, {high}]")
+        sides.append(f"{axis} = {value([_text(end, 'm') for end in ends])}")
     yield f"region = {{ replaces = true, {', '.join(sides)} }}  # the scanner's range, as far as the driver knows it"
 
 
 def _bias(answers: Mapping[str, ParameterReading]) -> Iterator[_Proposal]:
-    if (value := _number(answers.get(names.TIP_BIAS_VOLTAGE))) is not None:
-        most = max(_LEAST_BIAS_V, _BIAS_FACTOR * abs(value))
-        why = f"{quantity(value, 'V')} was in force: twice that to each side, at least 1 V"
+    if (bias_v := _number(answers.get(names.TIP_BIAS_VOLTAGE))) is not None:
+        most = max(_LEAST_BIAS_V, _BIAS_FACTOR * abs(bias_v))
+        why = f"{quantity(bias_v, 'V')} was in force: twice that to each side, at least 1 V"
         yield _Proposal(names.TIP_BIAS_VOLTAGE, -most, most, most, "V", why)
 
 
 def _setpoint(found: Contact) -> Iterator[_Proposal]:
     answer = found.answers.get(names.ZCTRL_SETPOINT)
-    value = _number(answer)
-    if answer is None or not value:
+    setpoint = _number(answer)
+    if answer is None or not setpoint:
         return
     unit = answer.row.si_unit
-    current = unit == "A"
-    low, high = sorted(value * factor for factor in (_SETPOINT_FACTORS if current else _AMPLITUDE_FACTORS))
-    why = (
-        f"{quantity(value, unit)} was in force: from a tenth to five times that"
-        if current
-        else (f"{quantity(value, unit)} was in force: half of that to each side")
-    )
+    factors, way = _OF_CURRENT if unit == "A" else _OF_AMPLITUDE
+    low, high = sorted(setpoint * factor for factor in factors)
+    why = f"{quantity(setpoint, unit)} was in force: {way}"
     if found.most_setpoint is not None:
-        low, high = (low, found.most_setpoint) if value > 0 else (found.most_setpoint, high)
+        low, high = (low, found.most_setpoint) if setpoint > 0 else (found.most_setpoint, high)
         why = f"{why}, within the preamplifier's reach"
-    yield _Proposal(names.ZCTRL_SETPOINT, low, high, abs(value), unit, why)
+    yield _Proposal(names.ZCTRL_SETPOINT, low, high, abs(setpoint), unit, why)
 
 
 def _number(answer: ParameterReading | None) -> float | None:
     return answer.value if answer is not None and type(answer.value) is float else None
 
 
-def _text(value: float, unit: str) -> str:
-    return quantity(value, unit, 6) if unit else f"{value:.6g}"
-
-
-def _toml(value: str) -> str:
-    return '"' + value.replace("\\", "\\\\").replace('"', '\\"').replace("µ", "u").replace("−", "-") + '"'
+def _text(number: float, unit: str) -> str:
+    return quantity(number, unit, 6) if unit else f"{number:.6g}"

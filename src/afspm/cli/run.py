@@ -142,7 +142,7 @@ def _require_limits(experiment: Experiment, only: Collection[str], without: Coll
     # a person has set limits for a real controller, or wants none
     import sys
 
-    from afspm.cli import contacting
+    from afspm.cli import contacting, examination
     from afspm.experiment.process_starts import chosen_names
 
     resolved = experiment.resolved
@@ -157,11 +157,7 @@ def _require_limits(experiment: Experiment, only: Collection[str], without: Coll
         what = "no limits are set for a real controller"
         hint = "`afspm new instrument` proposes some; or say that you want none: [limits] none = true"
         raise ConfigError(what, where=str(experiment.files[0]), hint=hint)
-    at, found, _ = contacting.asked(kind, settings)
-    if found is not None:
-        for line in contacting.told(found, at):
-            if line.code == "reading":
-                typer.echo(f"{line.where}: {line.what}")
+    examination.show(contacting.asked(kind, settings)[1])
     typer.confirm("No limits are set ([limits]): nothing that a component asks for is refused. Run?", abort=True)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from afspm.basics import entry_points
 from afspm.basics.errors import ConfigError
@@ -10,6 +11,9 @@ from afspm.experiment import class_loader
 from afspm.experiment.findings import nearest
 from afspm.experiment.resolved_experiment import ResolvedExperiment
 from afspm.model import Role
+
+if TYPE_CHECKING:
+    from afspm.translator.driver_base import DriverBase
 
 _DETECTORS = """
 [scheduler]
@@ -28,22 +32,29 @@ class = "LineWatch"
 """
 
 
+def driver_of(maker: str) -> tuple[str, type[DriverBase]]:
+    """Return the name and class of a maker's driver by its short name, in any case: "nanonis".
+
+    Raises:
+        ConfigError: there is no such driver.
+    """
+    drivers = {name.lower(): name for name in entry_points.names(entry_points.DRIVERS)}
+    if maker.lower() not in drivers:
+        raise ConfigError(f"there is no driver {maker!r}", where="--on", hint=nearest(maker.lower(), drivers))
+    name = drivers[maker.lower()]
+    driver: type[DriverBase] = entry_points.load(entry_points.DRIVERS, name)
+    return name, driver
+
+
 def shadow_file(maker: str, folder: Path) -> Path:
     """Write an experiment into `folder`: all detectors that need no settings, on the microscope of a maker.
-
-    Args:
-        maker: the short name of a driver, in any case: "nanonis".
 
     Raises:
         ConfigError: there is no such driver.
     """
     from afspm.translator.driver_base import DriverBase
 
-    drivers = {name.lower(): name for name in entry_points.names(entry_points.DRIVERS)}
-    if maker.lower() not in drivers:
-        raise ConfigError(f"there is no driver {maker!r}", where="--on", hint=nearest(maker.lower(), drivers))
-    name = drivers[maker.lower()]
-    driver: type[DriverBase] = entry_points.load(entry_points.DRIVERS, name)
+    name, driver = driver_of(maker)
     watcher: type[DriverBase] = class_loader.load(driver.shadow) if driver.shadow else driver  # refused by the overlay
     has_lines = watcher.lines is not DriverBase.lines
     lines = ["[microscope]", "component = true", f'class = "{name}"', *(['live_lines_s = "1 s"'] if has_lines else [])]

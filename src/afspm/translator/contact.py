@@ -19,9 +19,11 @@ from afspm.basics.plain_data import Plain
 from afspm.model import ScopeStatus, names
 from afspm.translator.driver_base import LOST, DriverBase
 from afspm.translator.parameters import ParameterSpec, Value
-from afspm.translator.shadow import is_refusal
+from afspm.translator.shadow import NotSent
 
-_FACTORS: Final = (5.0, 4.0, 3.0, 2.0, 1.5, 1.0)
+MOST: Final = 5.0
+"""The largest proposed setpoint, in times of the one in force."""
+_LESS: Final = (4.0, 3.0, 2.0, 1.5, 1.0)
 
 
 @dataclass(frozen=True)
@@ -32,17 +34,14 @@ class ParameterReading:
         value: in the unit of `row`; None: there is none, see `fault`.
         took_s: real time.
         fault: why there is no value.
+        was_asked: False for a question that the shadow does not send.
     """
 
     row: ParameterSpec
     value: Value | None
     took_s: float
     fault: str = ""
-
-    @property
-    def was_asked(self) -> bool:
-        """False for a question that the shadow does not send."""
-        return not is_refusal(self.fault)
+    was_asked: bool = True
 
 
 @dataclass
@@ -50,16 +49,17 @@ class Contact:
     """The answers of a controller.
 
     Attributes:
+        address: of the controller.
         logged: the log lines of the driver, with their levels: the release, the preamplifier, missing modules.
         connected_s: the real time until the driver was connected; None: it could not be, see `lost`.
         lost: why the controller did not answer, or no longer.
         status: its state; None: unknown.
         answers: by the generic names of parameters.
         reach: the range of the scanner, by the names of places.
-        results: names of finished measurements, oldest first, as far as the driver looks for them.
-        most_setpoint: the largest setpoint that the preamplifier reaches, if five times the one in force is beyond it.
+        most_setpoint: the largest setpoint that the preamplifier reaches; None: at least `MOST` times the one in force.
     """
 
+    address: str
     logged: list[tuple[int, str]] = field(default_factory=list)
     connected_s: float | None = None
     lost: Exception | None = None
@@ -67,18 +67,17 @@ class Contact:
     status: ScopeStatus | None = None
     answers: dict[str, ParameterReading] = field(default_factory=dict)
     reach: Mapping[str, ParameterSpec] = field(default_factory=dict)
-    results: tuple[str, ...] = ()
     most_setpoint: float | None = None
 
 
 class _Kept(logging.Handler):
     def __init__(self, logged: list[tuple[int, str]]) -> None:
         super().__init__(logging.INFO)
-        self._said = logged
+        self._logged = logged
 
     def emit(self, record: logging.LogRecord) -> None:
-        if (one := (record.levelno, record.getMessage())) not in self._said:
-            self._said.append(one)
+        if (one := (record.levelno, record.getMessage())) not in self._logged:
+            self._logged.append(one)
 
 
 def contact(driver: DriverBase) -> Contact:
@@ -88,7 +87,7 @@ def contact(driver: DriverBase) -> Contact:
         driver: one that `only_reads`.
     """
     assert driver.only_reads
-    found, clock = Contact(), ExperimentClock.real()
+    found, clock = Contact(driver.controller_at), ExperimentClock.real()
     log = logging.Logger("contact", logging.INFO)  # without parents: the lines are shown by the caller
     log.addHandler(_Kept(found.logged))
     memory: Plain = {}
@@ -102,7 +101,7 @@ def contact(driver: DriverBase) -> Contact:
             found.identity, found.status = driver.identity, driver.status()
             for name, row in driver.table.items():
                 found.answers[name] = _asked(driver, name, row, clock)
-            found.reach, found.results = dict(driver.reach()), tuple(driver.results())
+            found.reach = dict(driver.reach())
             found.most_setpoint = _most_setpoint(driver, found)
         except (*LOST, AfspmError) as error:
             found.lost = error
@@ -115,24 +114,25 @@ def _most_setpoint(driver: DriverBase, found: Contact) -> float | None:
     # by asking whether a setpoint would be refused: the driver knows the preamplifier, and nothing is set
     before = {name: one.value for name, one in found.answers.items() if one.value is not None}
     value = before.get(names.ZCTRL_SETPOINT)
-    for factor in _FACTORS:
-        if not isinstance(value, float):
-            return None
+    if not isinstance(value, float):
+        return None
+    for factor in (MOST, *_LESS):
         try:
             driver.refuse_unreachable({names.ZCTRL_SETPOINT: factor * value}, before)
         except Refused:
             continue
-        return None if factor == _FACTORS[0] else factor * value
+        return None if factor == MOST else factor * value
     return None
 
 
 def _asked(driver: DriverBase, name: str, row: ParameterSpec, clock: ExperimentClock) -> ParameterReading:
     began_s = clock.monotonic_s()
+    value: Value | None = None
+    fault, was_asked = "", True
     try:
-        value: Value | None = driver.in_force([name])[name]
-        fault = ""
+        value = driver.in_force([name])[name]
     except LOST:
         raise
     except Exception as error:  # of a driver, which may raise anything: the fault is shown
-        value, fault = None, str(error)
-    return ParameterReading(row, value, clock.monotonic_s() - began_s, fault)
+        fault, was_asked = str(error), not isinstance(error, NotSent)
+    return ParameterReading(row, value, clock.monotonic_s() - began_s, fault, was_asked)

@@ -46,21 +46,17 @@ class ShadowDriver(DriverBase):
         raise refusal(", ".join(values))
 
 
-_NOT_SENT = "not sent, since a shadow only reads the controller"
+class NotSent(Refused):
+    """The refusal of everything that is no question."""
 
 
-def is_refusal(text: str) -> bool:
-    """Return whether a reason comes from `refusal`."""
-    return text.endswith(_NOT_SENT)
-
-
-def refusal(what: str) -> Refused:
+def refusal(what: str) -> NotSent:
     """Return the refusal of everything that is no question."""
-    reason = f"{what}: {_NOT_SENT}"
-    return Refused(ControlResponse.ACTION_NOT_SUPPORTED, reason)
+    reason = f"{what}: not sent, since a shadow only reads the controller"
+    return NotSent(ControlResponse.ACTION_NOT_SUPPORTED, reason)
 
 
 def require_question(what: str, questions: Collection[str]) -> None:
-    """Raise Refused unless the name of a call is in the list of questions."""
+    """Raise NotSent unless the name of a call is in the list of questions."""
     if what not in questions:
         raise refusal(what)

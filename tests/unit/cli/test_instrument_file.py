@@ -22,8 +22,8 @@ def limits(kind: type[Any] = Nanonis, most: float | None = None, **values: float
         if value is not None
     }
     reach = {name: rows[name] for name in (names.PROBE_POS_X, names.PROBE_POS_Y) if name in rows}
-    found = Contact(answers=answers, reach=reach, most_setpoint=most)
-    text = text_of(kind.__name__, {"address": "127.0.0.1:6501"}, kind.channels_of({}), found, "2026-03-14")
+    found = Contact("127.0.0.1:6501", answers=answers, reach=reach, most_setpoint=most)
+    text = text_of(kind.__name__, kind.channels_of({}), found, "2026-03-14")
     read: dict[str, Any] = tomllib.loads(text)["limits"]
     return read
 
