@@ -208,7 +208,7 @@ def bad_night(seed: int) -> Plan:
 
 
 FINDERS = [
-    *map(bad_night, (9, 14, 11, 5, 13, 6, 0, 3, 58)),
+    *map(bad_night, (9, 14, 11, 5, 13, 6, 0, 3, 18, 35)),
     *(
         Plan(5, 2.0, cast=("experiment", "person", "careless"), lease_s=None, ends=True, faults=faults)
         # they end while the tip is in danger, the first while the translator does not answer

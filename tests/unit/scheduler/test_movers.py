@@ -153,6 +153,28 @@ def test_steps_away_are_forgotten_when_the_tip_moves_otherwise(motor: Motor, act
     assert "0 of 40" in motor.refusal(RIGHT).reason
 
 
+def test_steps_away_are_forgotten_when_the_motor_moves_without_a_request(motor: Motor) -> None:
+    motor.goes_right()
+    motor.lab.publish("TipStatus", TipStatus(engaged=False))
+    motor.lab.scope_is(ScopeState.COARSE_MOTOR)  # a person approaches, and withdraws before the tip is there
+    motor.lab.scope_is(ScopeState.FREE)
+    why = motor.refusal(RIGHT)
+    assert "0 of 40" in why.reason
+    assert why.detail is ResponseDetail.STEP_AWAY_AGAIN
+
+
+def test_steps_away_count_though_the_motor_is_seen_moving(motor: Motor) -> None:
+    motor.withdraws()
+    for _ in range(2):
+        motor.asks(AWAY)
+        motor.lab.scope_is(ScopeState.COARSE_MOTOR)
+        flight = motor.lab.in_flight()
+        assert flight is not None
+        motor.lab.answer(flight)
+        motor.lab.scope_is(ScopeState.FREE)
+    motor.does(RIGHT)
+
+
 def test_steps_away_are_forgotten_when_a_person_brings_the_tip_back(motor: Motor) -> None:
     motor.withdraws()
     motor.does(AWAY)

@@ -136,6 +136,9 @@ def _update_scope_state(draft: StateDraft, state: ScopeState) -> None:
         draft.limits = draft.limits.with_movers(MoverState.free)
     elif state is ScopeState.INTERRUPTED:
         draft.limits = draft.limits.with_movers(MoverState.interrupted)
+    elif state is ScopeState.COARSE_MOTOR:
+        shown = draft.panel.tip.engaged
+        draft.limits = draft.limits.with_movers(lambda movers: movers.motor_moves(engaged=shown))
     elif state is ScopeState.UNDEFINED:
         draft.others_may_have_acted(unseen=True)
     draft.watchdog = draft.watchdog.state_reported(draft.microscope)

@@ -10,9 +10,9 @@ The two readings are `PROVED_AFTER_S` apart. A request counts from the moment at
 outcome, a move counts as made, and steps away do not.
 
 No controller shows its motor. So steps away and a person's word end wherever others may have used it
-(`MoverState.unknown`): with MANUAL (its begin and its end), an act by hand, a lost contact, and a restart of translator
-or scheduler. A lost contact and a restart, in which nothing is read, end the proof, too. The ways, and the approach
-that is needed, stay; a way then means "at least".
+(`MoverState.unknown`): with MANUAL (its begin and its end), an act by hand, a motor that moves without a request of the
+run, a lost contact, and a restart of translator or scheduler. A lost contact and a restart, in which nothing is read,
+end the proof, too. The ways, and the approach that is needed, stay; a way then means "at least".
 """
 
 from __future__ import annotations
@@ -84,6 +84,7 @@ class MoverState:
         pending: steps away that are not answered yet, by request.
         answered: steps away that are answered; they are made once the microscope is free.
         retracted: steps away that were made since the tip was last at the sample.
+        is_moving: whether a request that uses the motor was sent since the microscope was last free.
         is_unknown: whether others may have used the motor since the tip was last seen at the sample.
         cleared_by: the client through which a person has stated that the tip is far enough for a lateral move.
         cleared_s: the real monotonic time of that statement.
@@ -96,6 +97,7 @@ class MoverState:
     pending: Mapping[str, int] = field(default_factory=dict)
     answered: int = 0
     retracted: int = 0
+    is_moving: bool = False
     is_unknown: bool = False
     cleared_by: str = ""
     cleared_s: float = 0.0
@@ -125,7 +127,7 @@ class MoverState:
 
     def sent(self, settings: MoverSettings, name: str, way: float, request: str, *, is_repeated: bool) -> MoverState:
         """Count a move that is sent. A repeated one may be answered from memory, so its steps away do not count."""
-        state = replace(self, is_unproved=True, needs_approach=True, at_sample_ns=None)
+        state = replace(self, is_moving=True, is_unproved=True, needs_approach=True, at_sample_ns=None)
         if is_repeated:
             return state
         is_away = settings.movers[name].direction == "away"
@@ -143,7 +145,7 @@ class MoverState:
 
     def free(self) -> MoverState:
         """Count the answered steps away: the microscope is free."""
-        return replace(self, retracted=self.retracted + self.answered, answered=0)
+        return replace(self, retracted=self.retracted + self.answered, answered=0, is_moving=False)
 
     def interrupted(self) -> MoverState:
         """Forget the answered steps away: the microscope has not made them all."""
@@ -167,13 +169,17 @@ class MoverState:
 
     def withdrawn(self) -> MoverState:
         """Forget the steps away, since a withdrawal may end them."""
-        return replace(self, pending={}, answered=0, retracted=0)
+        return replace(self, pending={}, answered=0, retracted=0, is_moving=True)
+
+    def motor_moves(self, *, engaged: bool | None) -> MoverState:
+        """Take in that the motor moves; without a request of the run, others use it. See `unknown` for `engaged`."""
+        return self if self.is_moving else self.unknown(engaged=engaged, unseen=engaged is None)
 
     def approaching(self, settings: MoverSettings, action: str) -> MoverState:
         """Take in that an action is sent that brings the tip to the sample."""
         if action != settings.approach:
-            return replace(self.near(), at_sample_ns=None)
-        return replace(self.near(), is_unproved=True, needs_approach=False, at_sample_ns=None)
+            return replace(self.near(), is_moving=True, at_sample_ns=None)
+        return replace(self.near(), is_moving=True, is_unproved=True, needs_approach=False, at_sample_ns=None)
 
     def at_sample(self, *, is_back: bool, by_hand: bool) -> MoverState:
         """Take in that the tip is shown at the sample; `is_back`: it was away before."""
