@@ -28,6 +28,9 @@ _MARK: Final = re.compile(r"\(!([^)]*)\)")
 _EXPLAINED: Final = "ID"
 """The id in texts that explain the mark."""
 
+_RESTS_ON = {"seen": ("seen",), "documented": ("document", "file"), "believed": ("reported", "none")}
+"""Grades by the word of the table of counts."""
+
 
 def faults(folder: Path) -> Iterator[str]:
     """Yield what is wrong with the claims and marks of a driver, each with its place and remedy."""
@@ -40,7 +43,8 @@ def faults(folder: Path) -> Iterator[str]:
         yield f"{folder / maker_claims.FILE}: is missing; copy the one of another driver, and write its claims"
     settled_by = {step.name for step in all_steps()} | set(OBSERVATIONS)
     for name, one in claims.items():
-        if one.commission and one.commission not in settled_by:
+        is_look = one.step == maker_claims.LOOKS and one.commission != one.step and bool(one.ask)
+        if one.commission and one.commission not in settled_by and not is_look:
             known = ", ".join(sorted(settled_by))
             yield f"{folder / maker_claims.FILE}: {name}: no step is called {one.commission!r}; one of {known}"
     for file in sorted(one for one in folder.rglob("*") if one.suffix in MARKED and one.name != maker_claims.FILE):
@@ -59,17 +63,23 @@ def _faults_of_mark(within: str, claims: dict[str, MakerClaim]) -> Iterator[str]
 
 
 def counts() -> str:
-    """Return how many claims each maker has of each grade, in Markdown."""
-    lines = [
-        "| maker | " + " | ".join(GRADES) + " | settled by `afspm commission` |",
-        "| --- " * (len(GRADES) + 2) + "|",
-    ]
+    """Return how many claims each maker has by what they rest on, in Markdown."""
+    heads = ["claims", *_RESTS_ON, "settled by `afspm commission`", "seen or settled so"]
+    total: Counter[str] = Counter()
+    lines = [f"| maker | {' | '.join(heads)} |", "| --- " * (len(heads) + 1) + "|"]
     for driver, folder in quality.drivers().items():
-        claims = maker_claims.read(folder).values()
-        of = Counter(one.grade for one in claims)
-        cells = [of[grade] for grade in GRADES]
-        lines.append(f"| `{driver}` | {' | '.join(map(str, cells))} | {sum(bool(one.commission) for one in claims)} |")
-    meanings = [f"- **{grade}**: {meaning}." for grade, meaning in GRADES.items()]
+        of: Counter[str] = Counter()
+        for one in maker_claims.read(folder).values():
+            (rests_on,) = (word for word, grades in _RESTS_ON.items() if one.grade in grades)
+            is_settled = bool(one.commission)
+            of.update(["claims", rests_on, *[heads[4]] * is_settled, *[heads[5]] * (is_settled or rests_on == "seen")])
+        total += of
+        lines.append(f"| `{driver}` | {' | '.join(str(of[head]) for head in heads)} |")
+    lines.append(f"| all | {' | '.join(str(total[head]) for head in heads)} |")
+    meanings = [
+        f"- **{word}**: " + "; ".join(f"{GRADES[grade]} (*{grade}*)" for grade in grades) + "."
+        for word, grades in _RESTS_ON.items()
+    ]
     return "\n".join([*lines, "", *meanings]) + "\n"
 
 

@@ -64,6 +64,11 @@ def commanding(address: str, run: str) -> Iterator[Callable[[str], None]]:
         yield take_identity
 
 
+def is_elsewhere(address: str) -> bool:
+    """Return whether a controller's address is one of another computer."""
+    return not _names(address)[0]
+
+
 def _names(address: str) -> tuple[bool, set[str]]:
     # whether the controller is on this computer, and the same names for all spellings of an address
     plain = "".join(address.lower().split())

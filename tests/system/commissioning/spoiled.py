@@ -54,6 +54,19 @@ class OtherZNanonis(Nanonis):
         return (-found[0],) if name == "ZCtrl.ZPosGet" else found  # type: ignore[operator]
 
 
+class NoisyNanonis(Nanonis):
+    """A bias of this controller is read with a noise of 2 mV from end to end."""
+
+    off_v = 1e-3
+
+    def read(self, wanted: Any) -> dict[str, Any]:
+        found = super().read(wanted)
+        if names.TIP_BIAS_VOLTAGE in found:
+            self.off_v = -self.off_v
+            found[names.TIP_BIAS_VOLTAGE] = float(found[names.TIP_BIAS_VOLTAGE]) + self.off_v
+        return found
+
+
 class DeafNanonis(Nanonis):
     """A withdrawal has no effect, without an error."""
 

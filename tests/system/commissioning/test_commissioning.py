@@ -475,7 +475,7 @@ def test_claims_about_nanonis_are_settled_with_the_tip_withdrawn(tmp_path: Path)
         at_nanonis(tmp_path, "Scan.PropsSet", on, 0, all_saved, series, comment, modules, paste)
         return "y"
 
-    person = Person({"Switch *continuous* on": continuous, "Is the tip at the sample": False})
+    person = Person({"Switch *continuous* on": continuous, "Go through": False, "Is the tip at the sample": False})
     result = commissioned(tmp_path, "Nanonis", person)
     assert {name for name, verdict in result.claims.items() if verdict == "holds"} == {
         "angle-clockwise", "y-up", "continuous-off", "grabbed-rows", "grabbed-backward", "buffer-numbers", "safe-tip",
@@ -483,6 +483,81 @@ def test_claims_about_nanonis_are_settled_with_the_tip_withdrawn(tmp_path: Path)
     assert InstrumentReport.read(tmp_path / "report.toml").claims == result.claims
     assert any("WARNING: the safe tip is off" in line for line in person.shown)
     assert result.progress.results["safe-tip"].line == "OFF (its threshold: 1 nA)"
+
+
+def test_hands_at_the_panel_settle_how_the_program_behaves_by_itself(tmp_path: Path) -> None:
+    def move() -> str:
+        x, y, width, height, angle = at_nanonis(tmp_path, "Scan.FrameGet")
+        at_nanonis(tmp_path, "Scan.FrameSet", x + width / 4, y, width, height, angle)
+        return ""
+
+    def pause() -> str:
+        at_nanonis(tmp_path, "Scan.Action", 2, 0)
+        return ""
+
+    says: dict[str, str | bool | Callable[[], str]] = {
+        "Move the frame at the panel, then": move,
+        "go on at the new place": "yes",
+        "Pause the scan at the panel, then": pause,
+        "Does it show 96": "unseen",
+        "Is it refused": "no",
+        "Is the tip at the sample": False,
+    }
+    person = Person(says)
+    result = commissioned(tmp_path, "Nanonis", person)
+    lines = {name: f"{one.outcome.value}: {one.line}" for name, one in result.progress.results.items()}
+    assert lines["frame-in-scan"] == "passed: no scan was published"
+    assert lines["pause-at-panel"].startswith("passed: ")
+    assert lines["looks"] == "passed: 5 of 6 were answered"
+    of = ("frame-in-scan", "paused-as-ended", "pixels-of-16", "frame-bounds", "qplus-names")
+    assert [result.claims[name] for name in of] == [
+        "holds", "holds" if "taken for ended" in lines["pause-at-panel"] else "does not hold", "not shown",
+        "does not hold", "holds",
+    ]  # fmt: skip
+
+
+def test_feedback_switched_at_the_panel_is_read(tmp_path: Path) -> None:
+    def switch(on: int) -> Callable[[], str]:
+        def press() -> str:
+            igor = asylum.Link(f"tcp://{address(tmp_path)}", DEADLINE_S, time.monotonic)
+            igor.ask("AfspmFeedback", on)
+            igor.close()
+            return ""
+
+        return press
+
+    person = Person({"feedback off at": switch(0), "feedback on at": switch(1), "Is the tip at the sample": False})
+    result = commissioned(tmp_path, "Asylum", person)
+    assert result.progress.results["feedback-at-panel"].line == "read as the panel switches it", result.progress.results
+    assert result.claims["feedback-on"] == "holds"
+
+
+def test_person_may_leave_out_what_only_claims_need(tmp_path: Path) -> None:
+    result = commissioned(tmp_path, "Nanonis", Person({"Go through them?": False, "Is the tip at the sample": False}))
+    left = {name for name, one in result.progress.results.items() if one.line == "left out"}
+    assert left == {"connection", "frame-in-scan", "pause-at-panel", "looks"}
+
+
+def test_noise_of_a_reading_proposes_a_line_for_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    person = Person({"scanner can't reach it": False})
+    result = commissioned(tmp_path, "Nanonis", person, "spoiled.NoisyNanonis")
+    assert "not steady: tip-bias-voltage by 2 mV" in result.progress.results["noise"].line
+    assert any('[microscope.parameters.tip-bias-voltage]\n  resolution = "4 mV"' in line for line in person.shown)
+
+
+@pytest.mark.parametrize("resolution", ["20 pm", "20 nm"])
+def test_feedback_switched_off_and_on_shows_how_z_stands(resolution: str, tmp_path: Path) -> None:
+    settings = f'[microscope.parameters.x-tip-z]\nresolution = "{resolution}"\n'
+    person = Person()
+    result = commissioned(tmp_path, "Nanonis", person, settings=settings, only="held-z")
+    line = result.progress.results["held-z"].line
+    if resolution == "20 pm":  # particles under a fast feedback: z is noisy
+        assert "with the feedback on" in line
+        assert any("[microscope.parameters.x-tip-z]" in one for one in person.shown)
+    else:
+        assert re.fullmatch(r"z moved by .*m while it was off, and by .*m once it was on again", line), line
 
 
 # nanonis 5

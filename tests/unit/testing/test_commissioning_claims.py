@@ -13,11 +13,11 @@ import pytest
 from afspm.model import Region, Scan, ScanLines
 from afspm.testing.commissioning import maker_claims
 from afspm.testing.commissioning.guide import Guide
-from afspm.testing.commissioning.lines_in_scan import places
+from afspm.testing.commissioning.lines_in_scan import places, retrace_runs_as_trace
 from afspm.testing.commissioning.maker_claims import MakerClaim
 from afspm.testing.commissioning.progress import CommissioningStep
 from afspm.testing.commissioning.steps import line_time
-from afspm.testing.conformance import Failed
+from afspm.testing.conformance import Failed, Unsupported
 from afspm.testing.translators.support import Support
 
 REGION = Region((0.0, 0.0), (1e-7, 1e-7))
@@ -53,6 +53,17 @@ def test_lines_that_are_alike_have_no_place(values: np.ndarray) -> None:
 
 def test_line_that_is_not_in_the_scan_has_no_place() -> None:
     assert list(places(scan(), lines(NOISE[:2] + NOISE[2:4]))) == []
+
+
+@pytest.mark.parametrize(("step", "runs_as_trace"), [(1, True), (-1, False)])
+def test_retrace_shows_whether_its_lines_are_mirrored(step: int, runs_as_trace: bool) -> None:
+    other = NOISE + 0.3 * np.random.default_rng(2).normal(size=NOISE.shape)
+    both = [scan(), scan(other[:, ::step], "current, retrace")]
+    assert retrace_runs_as_trace(both) is runs_as_trace
+    assert retrace_runs_as_trace(both[:1]) is None
+    assert retrace_runs_as_trace([scan(), scan(np.zeros_like(NOISE), "current, retrace")]) is None
+    unlike = np.random.default_rng(3).normal(size=NOISE.shape)
+    assert retrace_runs_as_trace([scan(), scan(unlike, "current, retrace")]) is None
 
 
 @pytest.mark.parametrize(
@@ -117,6 +128,15 @@ def test_claim_whose_preparation_is_not_confirmed_is_not_shown() -> None:
 def test_failed_step_refutes_only_the_claim_that_was_seen_to_fail() -> None:
     found = settled(Person("Switch it on", "down"))
     assert found == {"y-up": "does not hold", "whole": "not shown", "prepared": "not shown"}
+
+
+def test_step_for_claims_alone_is_not_asked_for_without_a_claim() -> None:
+    step = CommissioningStep(
+        name="pause-at-panel", title="", do=lambda _: "", explained="", moves=False, for_claims=True
+    )
+    kit: Any = SimpleNamespace(support=Support({}, {}))
+    with pytest.raises(Unsupported, match="no claim of this driver"):
+        Guide(kit, Person(), Path(), claims=CLAIMS).perform(step)
 
 
 def test_step_without_a_panel_settles_nothing_that_the_panel_shows() -> None:

@@ -9,11 +9,13 @@ from typing import Final, Protocol
 
 from afspm.basics.clock import Clock
 from afspm.basics.errors import UnitError
+from afspm.basics.formatting import quantity
 from afspm.basics.units import convert, parse_quantity
-from afspm.testing.commissioning.maker_claims import MakerClaim
+from afspm.testing.commissioning.maker_claims import LOOKS, MakerClaim
 from afspm.testing.commissioning.progress import CommissioningStep
 from afspm.testing.conformance import Declined, Failed, Lost, Skipped, Unsupported, near
 from afspm.testing.translators.measuring import CheckMeasurements
+from afspm.translator.parameters import ParameterSpec
 
 
 class Prompts(Protocol):
@@ -34,6 +36,10 @@ class Prompts(Protocol):
 UNSEEN = "unseen"
 _TRIES: Final = 5
 """Most questions for one value."""
+_FURTHER: Final = (
+    "The next steps try how the maker's program behaves by itself, which was never seen. They take some 15 minutes "
+    "at the panel, and your first night does not need them. Go through them?"
+)
 NO_PANEL = "a simulated microscope has no panel"
 
 
@@ -50,6 +56,9 @@ class Guide:
         counts_clockwise: True if the controller's panel shows angles clockwise.
         approaches: True for a simulated tip, which no person can bring to the sample.
         in_contact: True if the person has approached the tip, which is withdrawn after the steps at the sample.
+        is_remote: True if the controller runs on another computer.
+        rows: the driver's rows of the settings for which a measurement stands, and of the height of the tip.
+        section: the translator's section in the experiment file.
         claims: the driver's claims about the maker's program, by id.
         seen: the observations that settle claims, by the names in `MakerClaim.commission`: True if the claim holds.
         unprepared: the claims whose preparation the person has not confirmed: no step settles them.
@@ -65,10 +74,14 @@ class Guide:
     counts_clockwise: bool = False
     approaches: bool = False
     in_contact: bool = False
+    is_remote: bool = False
+    rows: Mapping[str, ParameterSpec] = field(default_factory=dict)
+    section: str = ""
     claims: Mapping[str, MakerClaim] = field(default_factory=dict)
     seen: dict[str, bool] = field(default_factory=dict)
     unprepared: set[str] = field(default_factory=set)
     _is_unseen: bool = False
+    _goes_further: bool | None = None
 
     @property
     def clock(self) -> Clock:
@@ -86,9 +99,13 @@ class Guide:
             raise Unsupported("this microscope has no tip")
         if step.about_lines and not self.has_lines:
             raise Unsupported("no line of a running scan is published")
+        if step.for_claims and not any(one.step == step.name for one in self.claims.values()):
+            raise Unsupported("no claim of this driver depends on it")
         self.prompts.show(f"\n{step.title}\n{step.explained}")
         if step.needs_panel and not self.has_panel:
             raise Skipped(f"{NO_PANEL} or cable")
+        if step.for_claims and not self._goes_on():
+            raise Skipped("left out")
         self._is_unseen = False
         self._prepare(step)
         if step.moves and not self.prompts.confirm("Shall afspm do this now?"):
@@ -99,10 +116,15 @@ class Guide:
             self.seen[step.name] = True
         return line
 
+    def _goes_on(self) -> bool:
+        if self._goes_further is None:
+            self._goes_further = self.prompts.confirm(_FURTHER)
+        return self._goes_further
+
     def _prepare(self, step: CommissioningStep) -> None:
         for name, claim in self.claims.items():
-            if claim.ask and claim.step == step.name:
-                question = f"{claim.ask} Is it done?"
+            if claim.ask and claim.step == step.name != LOOKS:
+                question = f"{claim.ask} Is it so?"
                 if not (self._can_be_seen(question) and self.prompts.confirm(question)):
                     self.unprepared.add(name)
 
@@ -203,6 +225,25 @@ class Guide:
                 self.seen[shows] = False
                 raise Failed(f"{what} as at the panel, {typed}", shown)
         raise Skipped(f"{what}: none of {_TRIES} answers could be compared with {shown}")
+
+    def propose_resolution(self, row: ParameterSpec, readings: Sequence[float]) -> str:
+        """Propose a `resolution` where readings of a steady value differ by more than the row allows.
+
+        Args:
+            readings: in the unit that the translator answers in.
+
+        Returns:
+            the difference of the largest and the smallest, as text; empty: the row allows it.
+        """
+        ends = [float(row.parse(f"{end!r}", row.wire_unit)) for end in (min(readings), max(readings))]
+        if row.same(*ends):
+            return ""
+        spread = ends[1] - ends[0]
+        self.prompts.show(
+            f"  For the experiment file, unless it was changed meanwhile:\n"
+            f'  [{self.section}.parameters.{row.name}]\n  resolution = "{quantity(2.0 * spread, row.si_unit, 2)}"'
+        )
+        return quantity(spread, row.si_unit, 2)
 
     def compare_angle(self, turned_deg: float) -> bool:
         """Compare a counter-clockwise angle with the number at the panel, which may count clockwise."""

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from afspm.model import Scan, ScanLines
+from afspm.model.arrays import Array
+from afspm.model.line_levelling import Levelling, levelled
+from afspm.model.variables import RETRACE
 
 _SAME: Final = 1e-3
 """Largest difference of the same line in memory and file, as a part of the difference between two lines."""
+
+_LIKE: Final = 0.5
+"""Least correlation of trace and retrace, in the order that is right."""
+_APART: Final = 0.2
+"""Least difference of the correlations in both orders."""
 
 
 @dataclass(frozen=True)
@@ -42,3 +50,26 @@ def places(scan: Scan, lines: Iterable[ScanLines]) -> Iterator[LinePlace]:
             # NaN sorts last, and compares as False
             if distances[nearest] < _SAME * distances[next_one]:
                 yield LinePlace(nearest % scan.shape[0] == index, bool(nearest >= scan.shape[0]), retrace)
+
+
+def retrace_runs_as_trace(scans: Sequence[Scan]) -> bool | None:
+    """Return whether the lines of a retrace run as those of its trace do; None if no pair of scans shows it."""
+    by_role = {role: scan for scan in scans for role in scan.roles}
+    for role, trace in by_role.items():
+        retrace = by_role.get(role + RETRACE)
+        if retrace is None or retrace.shape != trace.shape:
+            continue
+        a = levelled(trace.values, Levelling.LINES)
+        same, mirrored = (
+            _likeness(a, levelled(one, Levelling.LINES)) for one in (retrace.values, retrace.values[:, ::-1])
+        )
+        if max(same, mirrored) > _LIKE and abs(same - mirrored) > _APART:
+            return same > mirrored
+    return None
+
+
+def _likeness(a: Array, b: Array) -> float:
+    both = np.isfinite(a) & np.isfinite(b)
+    if not both.any() or min(np.ptp(a[both]), np.ptp(b[both])) == 0.0:
+        return 0.0
+    return float(np.corrcoef(a[both], b[both])[0, 1])

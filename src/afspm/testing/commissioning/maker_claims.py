@@ -21,6 +21,8 @@ GRADES: Final[Mapping[str, str]] = {
     "file": "files of real instruments",
     "none": "no evidence",
 }
+LOOKS: Final = "looks"
+"""The step that asks the person what only a person can see: one observation each, "looks/pixels-of-16"."""
 HOLDS, FALSE, NOT_SHOWN = "holds", "does not hold", "not shown"
 
 
@@ -36,7 +38,8 @@ class MakerClaim:
         contrary: the source of a contrary report; empty: none.
         commission: the step of `afspm commission` that settles the claim, "angle", or one observation of a step,
             "lines/rows"; empty: none does.
-        ask: what the person prepares at the panel before that step; empty: nothing.
+        ask: what the person prepares at the panel before that step, or what must be so for it to say anything; of a
+            look, the question whose yes means that the claim holds.
     """
 
     claim: str

@@ -25,6 +25,7 @@ from afspm.testing.translators.client import value_in
 from afspm.testing.translators.report import CheckReport
 from afspm.testing.translators.runner import restored
 from afspm.testing.translators.session import CheckOptions, CheckSession, opened, prepare
+from afspm.translator.controller_lock import is_elsewhere
 
 REHEARSAL_PATIENCE: Final = 10.0
 """Factor of the limits in real time with a simulated microscope: its program shares the computer with afspm, and a busy
@@ -132,6 +133,9 @@ def _in_session(
                 program_s=session.program_s,
                 counts_clockwise=session.counts_clockwise,
                 approaches=session.simulated,
+                is_remote=is_elsewhere(session.address),
+                rows=session.rows,
+                section=session.section,
                 claims=claims,
             )
             walk = _Walk(guide, result, write)

@@ -48,6 +48,7 @@ class CommissioningStep(Check):
         moves: True if the step acts on the microscope, so that the person confirms the step first.
         needs_panel: True if the person acts at the panel or the cable; without a panel the step is skipped.
         about_tip: True if the person says where the tip is.
+        for_claims: True if the step only settles claims of the driver; the person may leave all these steps out.
         about_lines: True if the step reads the lines of a running scan.
         contact: True if the tip is at the sample; the tip is withdrawn after the step.
         remembered: True if a resumed commissioning skips the passed step; steps about the tip are always repeated.
@@ -59,6 +60,7 @@ class CommissioningStep(Check):
     moves: bool = True
     needs_panel: bool = False
     about_tip: bool = False
+    for_claims: bool = False
     about_lines: bool = False
     contact: bool = False
     remembered: bool = True

@@ -21,7 +21,8 @@ from afspm.model import ChannelRoles, ControlRequest, Feedback, RegionChange, Sc
 from afspm.model.arrays import Array
 from afspm.model.requests import Parameter
 from afspm.testing.commissioning import lines_in_scan, moved_frame
-from afspm.testing.commissioning.guide import Guide
+from afspm.testing.commissioning.guide import UNSEEN, Guide
+from afspm.testing.commissioning.maker_claims import LOOKS
 from afspm.testing.commissioning.progress import CommissioningStep
 from afspm.testing.conformance import Declined, Failed, Lost, Skipped, expect
 from afspm.testing.translators.checks import frames, picture, scans
@@ -33,16 +34,29 @@ READ, FRAME, ANGLE, SCAN, END, FILES, STOP, LOSS, AXES = (
     "read", "frame", "angle", "scan", "end of a scan", "files", "stop", "lost connection", "axes",
 )  # fmt: skip
 UP, LINE_TIME, ROWS, COLUMNS = "frame/y-up", "scan/line-time", "lines/rows", "lines/columns"
-SETPOINT: Final = f"panel/{names.ZCTRL_SETPOINT}"
+ENGAGES, STOP_WITHDRAWS, BACKWARD = "scan/engages", "stop-at-panel/withdraws", "axes/backward"
+MOVES, PAUSE_ENDS, PAUSE_UNSEEN = "frame-in-scan/moves", "pause-at-panel/ends", "pause-at-panel/unseen"
+CURVE_AS_SCAN, SILENCES = "curve-at-panel/as-scan", "dialog/silences"
+REMOTE, HAS_GAIN = "controller/remote", f"controller/{names.ZCTRL_PGAIN}"
+COMPARED: Final = (names.ZCTRL_SETPOINT, names.TIP_BIAS_VOLTAGE, names.ZCTRL_PGAIN, names.CURRENT)
+"""The values that the person compares with the panel, the last two only where a claim depends on them."""
+SETPOINT, BIAS, GAIN, CURRENT = PANEL = tuple(f"panel/{name}" for name in COMPARED)
 WITHDRAWN: Final = "contact/withdrawn"
-OBSERVATIONS: Final = (UP, LINE_TIME, ROWS, COLUMNS, SETPOINT, WITHDRAWN)
-"""Observations within steps that settle claims, beside the passed steps themselves."""
+OBSERVATIONS: Final = (
+    UP, LINE_TIME, ROWS, COLUMNS, ENGAGES, STOP_WITHDRAWS, BACKWARD, MOVES, PAUSE_ENDS, PAUSE_UNSEEN, CURVE_AS_SCAN,
+    SILENCES, REMOTE, HAS_GAIN, *PANEL, WITHDRAWN,
+)  # fmt: skip
+"""Observations within steps that settle claims, beside the passed steps themselves and the looks."""
 OPERATIONS: Final = (READ, FRAME, ANGLE, SCAN, END, FILES, STOP, LOSS, AXES)
 LINES_REAL_S: Final = 2.0
 """Least real seconds of a scan that is watched while it fills."""
 _NOTICED_S: Final = 5.0
 """Seconds between the end of a scan at the panel and its publication: reaction, saving, polling."""
 _LOST_S: Final = 60.0
+_NOISE_S: Final = 60.0
+_LEAST_READINGS: Final = 8
+_HELD_S: Final = 5.0
+"""Experiment seconds for which the feedback is off."""
 _STEPS: list[CommissioningStep] = []
 _FRAME = (names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
 
@@ -97,6 +111,9 @@ def _controller(guide: Guide) -> str:
     guide.prompts.show(f"not supported: {', '.join(lacking) or 'nothing'}")
     expect(not support.errors, "an answer to every question", "; ".join(support.errors))
     guide.require("Is this the controller in front of you?", "the controller in front of the person")
+    guide.seen[HAS_GAIN] = support.has(names.ZCTRL_PGAIN)
+    if guide.is_remote:
+        guide.seen[REMOTE] = True
     return support.controller
 
 
@@ -144,10 +161,13 @@ def _compare_frame(guide: Guide, frame: FrameSetting) -> int:
 
 def _compare_values(guide: Guide) -> int:
     compared = 0
-    for name in (names.ZCTRL_SETPOINT, names.TIP_BIAS_VOLTAGE):
-        if guide.kit.support.has(name):
+    asked = {one.commission for one in guide.claims.values()} | {SETPOINT, BIAS}
+    for name, shows in zip(COMPARED, PANEL, strict=True):
+        if guide.kit.support.has(name) and shows in asked:
             found = guide.kit.client.get(name)
-            compared += guide.compare(name, number(found, found.unit or ""), found.unit or "", shows=f"panel/{name}")
+            value = number(found, found.unit or "")
+            noise = 0.1 * abs(value) if name == names.CURRENT else 0.0
+            compared += guide.compare(name, value, found.unit or "", noise, shows)
     return compared
 
 
@@ -172,6 +192,27 @@ def _safe_tip(guide: Guide) -> str:
         )
     guide.require_at_panel(f"The safe tip is {line}. Does the panel show the same?", "the panel's safe tip")
     return line
+
+
+@_step(
+    "The noise of the settings",
+    "afspm reads for a minute each setting for which a measurement stands. Leave the panel alone meanwhile.",
+    "Find out what changes these settings: no measurement can stand for them.",
+    after=("controller",),
+    moves=False,
+)
+def _noise(guide: Guide) -> str:
+    client = guide.kit.client
+    wanted = {name: row for name, row in guide.rows.items() if guide.kit.support.has(name) and row.is_number}
+    seen: dict[str, list[float]] = {name: [] for name in wanted}
+    until_s = client.clock.monotonic_s() + client.clock.real_s(_NOISE_S)
+    while not seen or client.clock.monotonic_s() < until_s or len(next(iter(seen.values()))) < _LEAST_READINGS:
+        for name, row in wanted.items():
+            seen[name].append(number(client.get(name), row.wire_unit))
+    noisy = {name: guide.propose_resolution(wanted[name], values) for name, values in seen.items()}
+    found = ", ".join(f"{name} by {spread}" for name, spread in noisy.items() if spread)
+    count = min(map(len, seen.values()), default=0)
+    return f"{len(wanted)} settings, {count} readings each: {f'not steady: {found}' if found else 'all steady'}"
 
 
 # --- with the tip withdrawn ---
@@ -328,9 +369,11 @@ def _watched(guide: Guide) -> tuple[Taken, float | None]:
     kit, client = guide.kit, guide.kit.client
     frame = kit.frames.plain
     expected_s = kit.prepare(frame, SCAN_S)
-    mark = client.observations.mark()
+    mark, was_away = client.observations.mark(), _engaged(guide) is False
     kit.act(names.START_SCAN)
     client.wait_state(ScopeState.SCANNING, mark)
+    if was_away:
+        guide.seen[ENGAGES] = bool(_engaged(guide))
     answer = guide.at_panel("Enter when the panel shows that the scan has ended (u: you can't see it)")
     panel_s = None if answer is None or answer.strip() else client.clock.now_s()
     limit_s = 1200.0 if expected_s is None else 5.0 * expected_s + 60.0
@@ -418,19 +461,32 @@ def _stop(guide: Guide) -> str:
 )
 def _stop_at_panel(guide: Guide) -> str:
     client = guide.kit.client
+    mark = _act_in_scan(guide, "Stop the scan at the panel", "stopped")
+    client.wait_state(ScopeState.FREE, mark, client.real_s(60.0))
+    observed = client.settled(mark)
+    if (engaged := _engaged(guide)) is not None and guide.seen.get(ENGAGES):
+        guide.seen[STOP_WITHDRAWS] = not engaged
+    _go_on(guide)
+    expect(not published(observed), "no scan that was stopped at the panel", describe_all(observed))
+    return "noticed, and no scan was published"
+
+
+def _act_in_scan(guide: Guide, act: str, done: str) -> int:
+    # begins a scan, and returns the mark before it once the person has acted at the panel
+    client = guide.kit.client
     # a person needs time to click
     mark, lasts_s = guide.kit.begin_long_scan(guide.kit.frames.other, STOPPED_REAL_S)
     lasts = "an unknown time: be quick" if lasts_s is None else f"about {client.clock.real_s(lasts_s):.0f} s"
     guide.prompts.show(f"  The scan lasts {lasts}.")
-    reply = guide.prompts.text("Stop the scan at the panel, then press Enter (u: it can't be stopped there)")
-    if reply.strip():
+    if guide.prompts.text(f"{act}, then press Enter (u: it can't be {done} there)").strip():
         client.come_to_rest()
-        raise Skipped("not stopped at the panel")
-    client.wait_state(ScopeState.FREE, mark, client.real_s(60.0))
-    observed = client.settled(mark)
-    _go_on(guide)
-    expect(not published(observed), "no scan that was stopped at the panel", describe_all(observed))
-    return "noticed, and no scan was published"
+        raise Skipped(f"not {done} at the panel")
+    return mark
+
+
+def _engaged(guide: Guide) -> bool | None:
+    # whether the tip reads as at the sample; None if the controller does not show it
+    return guide.kit.client.get(names.ENGAGED).value == "true" if guide.kit.support.has(names.ENGAGED) else None
 
 
 def _go_on(guide: Guide) -> None:
@@ -459,6 +515,146 @@ def _connection(guide: Guide) -> str:
     client.wait_state(ScopeState.FREE, mark, _LOST_S)
     client.regain_control(_LOST_S)
     return "noticed, and found again"
+
+
+# --- with the tip withdrawn: how the maker's program behaves by itself, as its driver claims ---
+
+
+@_step(
+    "Moving the frame while it is scanned",
+    "afspm begins a scan. Move its frame at the panel, by a quarter of its width.",
+    "Take over by `afspm pause` before you touch the panel; report it with the trace of this run.",
+    after=("stop-at-panel",),
+    for_claims=True,
+    needs_panel=True,
+    needs=(names.START_SCAN, names.STOP_SCAN),
+)
+def _frame_in_scan(guide: Guide) -> str:
+    client = guide.kit.client
+    mark = _act_in_scan(guide, "Move the frame at the panel", "moved")
+    moved = guide.prompts.choose("Does the scan go on at the new place?", ("yes", "no", UNSEEN), UNSEEN)
+    if moved != UNSEEN:
+        guide.seen[MOVES] = moved == "yes"
+    client.come_to_rest()
+    observed = client.settled(mark)
+    _go_on(guide)
+    expect(not published(observed), "no scan of a frame that was moved", describe_all(observed))
+    return "no scan was published"
+
+
+@_step(
+    "Pausing at the panel",
+    "afspm begins a scan. Pause it at the panel: afspm may take it for ended.",
+    "Do not pause scans at the panel; report it with the trace of this run.",
+    after=("stop-at-panel",),
+    for_claims=True,
+    needs_panel=True,
+    needs=(names.START_SCAN, names.STOP_SCAN),
+)
+def _pause_at_panel(guide: Guide) -> str:
+    client = guide.kit.client
+    mark = _act_in_scan(guide, "Pause the scan at the panel", "paused")
+    ends = _comes(guide, lambda: client.state is not ScopeState.SCANNING, _NOTICED_S)
+    guide.seen |= {PAUSE_ENDS: ends, PAUSE_UNSEEN: not ends}
+    guide.prompts.text("Let the scan go on at the panel, then press Enter")
+    client.come_to_rest()
+    observed = client.settled(mark)
+    _go_on(guide)
+    expect(not published(observed), "no scan that was paused and stopped", describe_all(observed))
+    return "taken for ended" if ends else "not shown by the controller"
+
+
+def _comes(guide: Guide, done: Callable[[], bool], within_s: float) -> bool:
+    try:
+        guide.kit.client.wait(done, within_s, "")
+    except Failed:
+        return False
+    return True
+
+
+@_step(
+    "Switching the feedback at the panel",
+    "Switch the z feedback at the panel, and back: afspm reads it. The tip is out of reach of the sample.",
+    "Do not rely on `x-feedback-on`: see the README of the driver; report it with the trace of this run.",
+    after=("withdrawn",),
+    for_claims=True,
+    moves=False,
+    needs_panel=True,
+    needs=(names.FEEDBACK_ON,),
+)
+def _feedback_at_panel(guide: Guide) -> str:
+    was_on = _feedback_is_on(guide)
+    for word, wanted in (("off" if was_on else "on", not was_on), ("on" if was_on else "off", was_on)):
+        if guide.prompts.text(f"Switch the feedback {word} at the panel, then press Enter (u: leave it)").strip():
+            raise Skipped("not switched at the panel")
+        guide.seen["feedback-at-panel"] = follows = _feedback_is_on(guide) is wanted
+        expect(follows, f"{names.FEEDBACK_ON} to read {word}", "the other")
+    _go_on(guide)
+    return "read as the panel switches it"
+
+
+def _feedback_is_on(guide: Guide) -> bool:
+    return str(guide.kit.client.get(names.FEEDBACK_ON).value).lower() in names.ON_WORDS
+
+
+@_step(
+    "A curve at the panel",
+    "Take a curve at the panel that lasts some ten seconds. The tip is out of reach of the sample.",
+    "Take curves by afspm alone while it scans.",
+    after=("withdrawn",),
+    for_claims=True,
+    moves=False,
+    needs_panel=True,
+)
+def _curve_at_panel(guide: Guide) -> str:
+    client, mark = guide.kit.client, guide.kit.client.observations.mark()
+    if guide.prompts.text("Begin a curve at the panel, then press Enter while it runs (u: leave it)").strip():
+        raise Skipped("no curve was taken")
+    _comes(guide, lambda: client.state is not ScopeState.FREE, _NOTICED_S)
+    guide.seen[CURVE_AS_SCAN] = client.state is ScopeState.SCANNING
+    shown = client.state.name
+    client.settled(mark)
+    _go_on(guide)
+    return f"the state meanwhile: {shown}"
+
+
+@_step(
+    "A dialog on the controller's screen",
+    "Open a dialog on the controller's screen, such as *Open file*: it may silence the program.",
+    "Close all dialogs before a night.",
+    after=("withdrawn",),
+    for_claims=True,
+    moves=False,
+    needs_panel=True,
+)
+def _dialog(guide: Guide) -> str:
+    client, mark = guide.kit.client, guide.kit.client.observations.mark()
+    if guide.prompts.text("Open a dialog, then press Enter (u: leave this out)").strip():
+        raise Skipped("left out")
+    guide.seen[SILENCES] = silent = _comes(guide, lambda: client.state is ScopeState.UNDEFINED, _LOST_S)
+    guide.prompts.text("Close the dialog, then press Enter")
+    if silent:
+        client.wait_state(ScopeState.FREE, mark, _LOST_S)
+        client.regain_control(_LOST_S)
+    return "the program is silent while it is open" if silent else "the program answers while it is open"
+
+
+@_step(
+    "What only you can see",
+    "Questions about the maker's program, each answered by a look or a try at the panel. Leave out what you can't try.",
+    "Nothing: each answer is a verdict on a claim of the driver.",
+    after=("withdrawn",),
+    for_claims=True,
+    moves=False,
+    needs_panel=True,
+)
+def _looks(guide: Guide) -> str:
+    looks = [one for one in guide.claims.values() if one.step == LOOKS]
+    for one in looks:
+        if (seen := guide.prompts.choose(one.ask, ("yes", "no", UNSEEN), UNSEEN)) != UNSEEN:
+            guide.seen[one.commission] = seen == "yes"
+    _go_on(guide)
+    return f"{sum(one.commission in guide.seen for one in looks)} of {len(looks)} were answered"
 
 
 # --- in contact ---
@@ -567,6 +763,9 @@ def _axes(guide: Guide) -> str:
         guide.kit.excuse("scan/picture", failure)
         raise
     taken = guide.kit.scan("wide" if guide.kit.can_pass("scan/not-square") else "plain").scans
+    roles = guide.kit.client.observations.newest(ChannelRoles) or ChannelRoles()
+    if (same_way := lines_in_scan.retrace_runs_as_trace([roles.shown(one) for one in taken])) is not None:
+        guide.seen[BACKWARD] = same_way
     scan = next((one for one in taken if one.unit == "m"), taken[0])
     file = guide.folder / "commissioning.png"
     levels = raster.indices(scan.values[::-1], raster.value_range(scan.values))
@@ -574,3 +773,40 @@ def _axes(guide: Guide) -> str:
     guide.prompts.show(f"  {scan.channel}, y upwards: {file}")
     guide.require_at_panel("Does the panel show the same picture, not mirrored and not turned?", "the panel's picture")
     return "details fit into the larger scan as reported"
+
+
+@_step(
+    "The feedback, off and on again",
+    f"afspm switches the z feedback off for {_HELD_S:g} s, holds z, and switches it on again. z is read before, "
+    "meanwhile and after. A tip lift of the controller would show here.",
+    "Do not hold z with this controller (constant height, `hold_z`): switch its tip lift off, or report it with the "
+    "trace of this run.",
+    after=("contact",),
+    contact=True,
+    needs=(names.FEEDBACK_ON, names.TIP_Z, names.HOLD_Z, names.RELEASE_Z),
+)
+def _held_z(guide: Guide) -> str:
+    kit, client = guide.kit, guide.kit.client
+    before = _heights(guide, 3.0 * _HELD_S)
+    row = guide.rows.get(names.TIP_Z)
+    # the translator compares means of as many readings
+    means = [float(one.mean()) for one in np.array_split(before, len(before) // _LEAST_READINGS)]
+    if row is not None and (spread := guide.propose_resolution(row, means)):
+        raise Skipped(f"z differs by {spread} between means of {_LEAST_READINGS} readings, with the feedback on")
+    kit.act(names.HOLD_Z)
+    held = _heights(guide, _HELD_S)
+    mark = client.observations.mark()
+    kit.act(names.RELEASE_Z)
+    client.settled(mark, awaiting=ScopeState.FREE)
+    expect(_feedback_is_on(guide), "the feedback on again", "it is off")
+    after = _heights(guide)
+    by = [quantity(float(np.mean(one) - np.mean(before)), "m") for one in (held, after)]
+    return f"z moved by {by[0]} while it was off, and by {by[1]} once it was on again"
+
+
+def _heights(guide: Guide, lasts_s: float = 0.0) -> list[float]:
+    clock, found = guide.kit.clock, list[float]()
+    until_s = clock.monotonic_s() + clock.real_s(lasts_s)
+    while len(found) < _LEAST_READINGS or clock.monotonic_s() < until_s:
+        found.append(number(guide.kit.client.get(names.TIP_Z), "m"))
+    return found

@@ -8,7 +8,7 @@ import tempfile
 import threading
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from afspm.client.component import Component
 from afspm.client.experiment_link import ExperimentLink
 from afspm.driver import Driver
 from afspm.experiment import Experiment, ProcessStart, Role, load
-from afspm.model import Frame
+from afspm.model import Frame, names
 from afspm.model.events import LOGGED_AS
 from afspm.record.run_json import STATE_DIR
 from afspm.supervisor import run_folder, run_identity
@@ -32,6 +32,9 @@ from afspm.testing.conformance import Lost
 from afspm.testing.processes import Processes
 from afspm.testing.translators.client import CheckClient
 from afspm.testing.translators.support import Support, find_out
+from afspm.translator.judge import SETTINGS
+from afspm.translator.parameters import ParameterSpec, ParameterTable
+from afspm.translator.setting_groups import FRAME
 from afspm.transport import Port
 from afspm.transport.port import ParentGone
 from afspm.transport.process.context import new_session
@@ -93,6 +96,9 @@ class CheckSession:
         program_s: real seconds that the controller's program may need beside measuring; see `Driver.program_s`.
         counts_clockwise: True if the controller's panel shows angles clockwise.
         has_tip: False for a microscope without a tip.
+        section: the translator's section in the experiment file.
+        address: the controller's address; empty: unknown, or on this computer.
+        rows: the driver's rows of the settings for which a measurement stands, and of the height of the tip.
         driver_folder: the folder of the driver's own files; None for a translator that is no driver.
     """
 
@@ -109,6 +115,9 @@ class CheckSession:
     counts_clockwise: bool = False
     has_tip: bool = True
     driver_folder: Path | None = None
+    section: str = ""
+    address: str = ""
+    rows: Mapping[str, ParameterSpec] = field(default_factory=dict)
 
 
 def prepare(options: CheckOptions) -> Experiment:
@@ -155,10 +164,12 @@ def opened(options: CheckOptions) -> Iterator[CheckSession]:
         named = translator.class_path or " ".join(translator.part.command)
         excused: Mapping[str, str] = {}
         maker, program_s, clockwise, folder_of_driver = "", 0.0, False, None
+        rows: Mapping[str, ParameterSpec] = {}
         if translator.component is not None and issubclass(translator.component, Driver):
             driver = translator.component
             excused, maker, program_s = driver.excused(support.controller), driver.maker, driver.program_s
             clockwise, folder_of_driver = driver.counts_clockwise, driver.parameters_file.parent
+            rows = _rows(driver, translator.settings.get("parameters"))
         yield CheckSession(
             client,
             support,
@@ -173,7 +184,17 @@ def opened(options: CheckOptions) -> Iterator[CheckSession]:
             clockwise,
             has_tip(experiment),
             folder_of_driver,
+            translator.name,
+            "" if simulated else str(translator.settings.get("address", "")),
+            rows,
         )
+
+
+def _rows(driver: type[Driver], changed: object) -> dict[str, ParameterSpec]:
+    table = ParameterTable.from_toml(driver.parameters_file)
+    if isinstance(changed, Mapping):
+        table = table.extended(changed, where="the experiment file")
+    return {name: table[name] for name in (*FRAME, *SETTINGS, *table.watched, names.TIP_Z) if name in table}
 
 
 @contextmanager
