@@ -44,7 +44,9 @@ def commission(
 
     Writes a report for people and programs. Ends with 0 if nothing was wrong.
     """
+    from afspm.basics.errors import FileError
     from afspm.basics.units import si
+    from afspm.cli import commission_pack
     from afspm.testing.commissioning.procedure import REHEARSAL_PATIENCE
     from afspm.testing.commissioning.procedure import commission as walk
     from afspm.testing.commissioning.report import TRIED_ON
@@ -69,6 +71,12 @@ def commission(
     if ended.lost:
         terminal.show(f"not completed: {ended.lost}")
     terminal.show(f"\nthe report: {file}")
+    to_send = file.with_name(f"{file.stem}-to-send")
+    try:
+        commission_pack.write(to_send, file, ended.folder, ended.scans)
+        terminal.show(f"to send, if you like, without names and places: {to_send} (its README.md lists all)")
+    except FileError as error:
+        terminal.show(f"no folder to send: {error}")
     terminal.show(f"log, trace and files: {ended.folder}")
     raise typer.Exit(0 if ended.passed else 1)
 

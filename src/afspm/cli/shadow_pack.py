@@ -116,19 +116,22 @@ def read(run: Run, hidden: Iterable[str] = ()) -> ShadowPack:
         hint = "`afspm shadow FILE` makes one; `afspm trace` records a run that commands"
         raise InvalidValue(f"the run in {run.folder} is no shadow", hint=hint)
     traces = sorted(run.folder.glob(f"*{FILE}"))
-    protocol = " ".join({line.what for line in _lines(traces) if isinstance(line, TracedExchange)})
-    texts = {
-        private.text: private for private in reversed([*_named(hidden), *_private(run, traces)]) if private.text.strip()
-    }
+    return ShadowPack(run, night, traces, *replaceable([*_named(hidden), *_private(run, traces)], traces))
+
+
+def replaceable(texts: Iterable[PrivateText], traces: Iterable[Path]) -> tuple[list[PrivateText], list[PrivateText]]:
+    """Return the texts to replace, the longest first, and those too short or part of a word of the protocol."""
+    protocol = " ".join({line.what for line in traced(traces) if isinstance(line, TracedExchange)})
+    different = {private.text: private for private in reversed(list(texts)) if private.text.strip()}
     replaced, short = list[PrivateText](), list[PrivateText]()
-    for private in sorted(texts.values(), key=lambda private: -len(private.text)):
+    for private in sorted(different.values(), key=lambda private: -len(private.text)):
         is_asked = private.where == _ASKED
         too_short = not is_asked and (len(private.text) < _SHORTEST or private.text in protocol)
         (short if too_short else replaced).append(private)
-    return ShadowPack(run, night, traces, replaced, short)
+    return replaced, short
 
 
-def _lines(traces: Iterable[Path]) -> Iterator[TraceLine]:
+def traced(traces: Iterable[Path]) -> Iterator[TraceLine]:
     for file in traces:
         yield from trace_lines(file)
 
@@ -141,20 +144,30 @@ def _private(run: Run, traces: Iterable[Path]) -> Iterator[PrivateText]:
     for name, value in run.metadata.items():
         if _WRITTEN_BY_PEOPLE.search(name):
             yield PrivateText(f"[metadata] {name}", value)
-    yield PrivateText("the user's name here", getpass.getuser())
-    yield PrivateText("the user's folder here", str(Path.home()))
-    yield PrivateText("the computer's name", str(run.facts.get(COMPUTER, "")))
+    yield from of_this_computer(str(run.facts.get(COMPUTER, "")))
     yield PrivateText("the experiment's name", run.name)
     for row in (*run.scans, *run.spectra):
-        yield from _of_path("a file of the controller", row.filename)
+        yield from of_path("a file of the controller", row.filename)
         if row.file:
             try:
                 yield from _of_header(run.about(row))
             except FileError:
                 continue  # a measurement whose file is lost is not packed either
-    for line in _lines(traces):
+    yield from of_trace(traces)
+
+
+def of_this_computer(name: str) -> Iterator[PrivateText]:
+    """Yield the private texts of the user and the computer of this name."""
+    yield PrivateText("the user's name here", getpass.getuser())
+    yield PrivateText("the user's folder here", str(Path.home()))
+    yield PrivateText("the computer's name", name)
+
+
+def of_trace(traces: Iterable[Path]) -> Iterator[PrivateText]:
+    """Yield names, folders and written entries of the controller's files, and folders in its answers."""
+    for line in traced(traces):
         if isinstance(line, TracedFile):
-            yield from _of_path("a file of the controller", line.file)
+            yield from of_path("a file of the controller", line.file)
             yield from _of_header(_header(line))
         elif isinstance(line, TracedExchange):
             for folder in _folders(line.answered):
@@ -190,7 +203,8 @@ def _texts(content: bytes) -> Iterator[bytes]:
             yield text
 
 
-def _of_path(where: str, name: str) -> Iterator[PrivateText]:
+def of_path(where: str, name: str) -> Iterator[PrivateText]:
+    """Yield the folder of a file, and its name without a number."""
     path = PureWindowsPath(name) if "\\" in name else PurePosixPath(name)
     if str(path.parent) not in (".", path.anchor):
         yield PrivateText(where, str(path.parent))
@@ -344,7 +358,7 @@ def write(pack: ShadowPack, folder: Path) -> list[str]:
         (folder / "pack.json").write_text(json.dumps(_facts(pack), indent=2) + "\n", encoding="utf-8")
     except OSError as error:
         raise FileError(f"can't be written: {error}", where=str(folder)) from error
-    _require_clean(folder, mask)
+    require_clean(folder, mask)
     return left_out
 
 
@@ -383,8 +397,8 @@ def _without_comment(row: shadow.ShadowRow) -> shadow.ShadowRow:
 
 
 def _facts(pack: ShadowPack) -> dict[str, object]:
-    load = load_of(_lines(pack.traces[:1]))
-    driver = next((line for line in _lines(pack.traces) if isinstance(line, TraceHeader)), TraceHeader("", "", ""))
+    load = load_of(traced(pack.traces[:1]))
+    driver = next((line for line in traced(pack.traces) if isinstance(line, TraceHeader)), TraceHeader("", "", ""))
     return {
         "afspm": driver.afspm,
         "driver": driver.driver,
@@ -396,7 +410,8 @@ def _facts(pack: ShadowPack) -> dict[str, object]:
     }
 
 
-def _require_clean(folder: Path, mask: Mask) -> None:
+def require_clean(folder: Path, mask: Mask) -> None:
+    """Raise FileError if a file of a folder still has a private text."""
     for file in sorted(folder.rglob("*")):
         if not file.is_file():
             continue

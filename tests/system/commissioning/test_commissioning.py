@@ -373,6 +373,9 @@ def test_the_command_asks_and_reports(tmp_path: Path) -> None:
     assert report.operations["axes"] == "blocked"
     assert report.claims["grabbed-rows"] == "holds"
     assert report.claims["angle-clockwise"] == "not shown", "an emulator has no panel that shows it"
+    sent = tmp_path / "experiment-commissioning-to-send"
+    files = {"README.md", "report.toml", "timings.csv", "versions.json", "in-the-air.nc"}
+    assert {file.name for file in sent.iterdir()} == files
     for step in ("panel", "stop-at-panel", "connection"):
         assert report.steps[step] == {"outcome": "skipped", "line": f"{NO_PANEL} or cable"}
     assert f"Where to, in the panel's picture? – skipped: {NO_PANEL}" in done.stdout

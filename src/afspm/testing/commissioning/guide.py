@@ -11,6 +11,7 @@ from afspm.basics.clock import Clock
 from afspm.basics.errors import UnitError
 from afspm.basics.formatting import quantity
 from afspm.basics.units import convert, parse_quantity
+from afspm.model import Scan
 from afspm.testing.commissioning.maker_claims import LOOKS, MakerClaim
 from afspm.testing.commissioning.progress import CommissioningStep
 from afspm.testing.conformance import Declined, Failed, Lost, Skipped, Unsupported, near
@@ -61,6 +62,7 @@ class Guide:
         section: the translator's section in the experiment file.
         claims: the driver's claims about the maker's program, by id.
         seen: the observations that settle claims, by the names in `MakerClaim.commission`: True if the claim holds.
+        scans: the scans that a report for others needs, all channels of each, by a name.
         unprepared: the claims whose preparation the person has not confirmed: no step settles them.
     """
 
@@ -79,6 +81,7 @@ class Guide:
     section: str = ""
     claims: Mapping[str, MakerClaim] = field(default_factory=dict)
     seen: dict[str, bool] = field(default_factory=dict)
+    scans: dict[str, list[Scan]] = field(default_factory=dict)
     unprepared: set[str] = field(default_factory=set)
     _is_unseen: bool = False
     _goes_further: bool | None = None

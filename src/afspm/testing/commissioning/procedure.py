@@ -13,7 +13,7 @@ from afspm.basics.errors import ConfigError
 from afspm.driver import Driver
 from afspm.experiment import Role
 from afspm.experiment.tracing import trace_overlay
-from afspm.model import ControlRequest, Parameter, Response, names
+from afspm.model import ControlRequest, Parameter, Response, Scan, names
 from afspm.testing.commissioning import maker_claims
 from afspm.testing.commissioning.guide import Guide, Prompts
 from afspm.testing.commissioning.maker_claims import MakerClaim
@@ -46,6 +46,7 @@ class CommissioningResult:
         file: the file of the report.
         lost: the reason of an early end; empty after all steps.
         folder: the run folder, with the log and the trace.
+        scans: one scan in the air and one at the sample, all channels of each, as far as they were taken.
     """
 
     progress: CommissioningProgress
@@ -53,6 +54,7 @@ class CommissioningResult:
     lost: str = ""
     folder: Path = Path()
     claims: dict[str, str] = field(default_factory=dict)
+    scans: dict[str, list[Scan]] = field(default_factory=dict)
 
     @property
     def passed(self) -> bool:
@@ -136,6 +138,7 @@ def _in_session(
                 is_remote=is_elsewhere(session.address),
                 rows=session.rows,
                 section=session.section,
+                scans=result.scans,
                 claims=claims,
             )
             walk = _Walk(guide, result, write)

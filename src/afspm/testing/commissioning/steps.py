@@ -382,6 +382,7 @@ def _watched(guide: Guide) -> tuple[Taken, float | None]:
     taken = Taken(frame, observed, expected_s)
     expect(taken.scans, "a Scan2d of the scan", "none: see the files of the controller")
     guide.kit.keep("scan of the plain frame", taken)
+    guide.scans["in-the-air"] = taken.scans
     return taken, panel_s
 
 
@@ -763,6 +764,7 @@ def _axes(guide: Guide) -> str:
         guide.kit.excuse("scan/picture", failure)
         raise
     taken = guide.kit.scan("wide" if guide.kit.can_pass("scan/not-square") else "plain").scans
+    guide.scans["at-the-sample"] = taken
     roles = guide.kit.client.observations.newest(ChannelRoles) or ChannelRoles()
     if (same_way := lines_in_scan.retrace_runs_as_trace([roles.shown(one) for one in taken])) is not None:
         guide.seen[BACKWARD] = same_way
