@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -78,6 +79,35 @@ def test_controller_is_asked_written_down_and_run_with_what_was_read(tmp_path: P
     file.write_text(bare + "[limits]\nnone = true\n", encoding="utf-8")
     code, text = told(tmp_path, "run", "experiment.toml", "instrument.toml", "--no-report")
     assert code == 0, text
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no such terminal there")
+@pytest.mark.parametrize(("answer", "runs"), [("n", False), ("y", True)])
+def test_run_without_limits_asks_at_a_terminal_with_the_values_in_force(
+    answer: str, runs: bool, tmp_path: Path, controller: str
+) -> None:
+    (tmp_path / "experiment.toml").write_text(SAMPLE, encoding="utf-8")
+    assert told(tmp_path, "new", "instrument", "nanonis", controller)[0] == 0
+    file = tmp_path / "instrument.toml"
+    file.write_text(file.read_text(encoding="utf-8").partition("[limits]")[0], encoding="utf-8")
+    ours, terminal = os.openpty()
+    try:
+        os.write(ours, f"{answer}\n".encode())
+        done = subprocess.run(
+            [*AFSPM, "run", "experiment.toml", "instrument.toml", "--no-report"],
+            cwd=tmp_path,
+            stdin=terminal,
+            capture_output=True,
+            encoding="utf-8",
+            timeout=DEADLINE_S,
+        )
+    finally:
+        os.close(terminal)
+        os.close(ours)
+    assert "tip-bias-voltage: 100 mV (" in done.stdout
+    assert "nothing that a component asks for is refused. Run?" in done.stdout
+    assert (done.returncode == 0) is runs, done.stdout + done.stderr
+    assert (tmp_path / "runs").exists() is runs
 
 
 def test_silent_and_missing_controllers_are_faults_with_a_remedy(tmp_path: Path) -> None:

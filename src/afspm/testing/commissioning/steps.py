@@ -203,7 +203,11 @@ def _safe_tip(guide: Guide) -> str:
 )
 def _noise(guide: Guide) -> str:
     client = guide.kit.client
-    wanted = {name: row for name, row in guide.rows.items() if guide.kit.support.has(name) and row.is_number}
+    wanted = {
+        name: row
+        for name, row in guide.rows.items()
+        if guide.kit.support.has(name) and row.is_number and not row.measured
+    }
     seen: dict[str, list[float]] = {name: [] for name in wanted}
     until_s = client.clock.monotonic_s() + client.clock.real_s(_NOISE_S)
     while not seen or client.clock.monotonic_s() < until_s or len(next(iter(seen.values()))) < _LEAST_READINGS:
