@@ -304,3 +304,24 @@ def test_saving_switched_off_in_a_scan_loses_that_scan_alone(bench: Make) -> Non
     received = peer.until(FREE)
     assert states(received) == ["SCANNING", "FREE"]
     assert scans(received)
+
+
+# the file of the person's scan became the result of the run's next one, and so on
+@pytest.mark.parametrize("is_over", [False, True])
+def test_scan_begun_at_once_after_a_scan_of_the_run_is_not_taken_for_it(bench: Make, is_over: bool) -> None:
+    made = bench()
+    peer, _ = slow_scan(made)
+
+    def begin_another(emulator: Any) -> None:
+        if is_over:
+            scan = emulator.program.rig.scan
+            scan.paused_s = emulator.program.now_s - scan.start_s - LINES * LINE_S  # its lines are complete
+        press(emulator, "stop_scan")
+        press(emulator, "start_scan")
+
+    made.at_panel(begin_another)
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", *([] if is_over else ["INTERRUPTED"]), "FREE"]
+    assert acts(received) == ([] if is_over else [PanelAct.STOP])
+    assert bool(scans(received)) is is_over
+    peer.until(ScopeState.SCANNING)  # the person's

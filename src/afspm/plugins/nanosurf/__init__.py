@@ -92,7 +92,7 @@ class Nanosurf(ScriptedDriver[Session, StudioActivity]):
     program_s: ClassVar[float] = 2.0
     never_shows: ClassVar = {
         "which measurement it is": "Studio names no file: the newest is taken",
-        "another one begun": "a stop and a start between two looks seem one scan",
+        "another one begun": "before Studio 19 a stop and a start between two looks seem one scan",
         "stop of a scan": "Studio shows only that no scan runs: an end that comes too soon counts as a stop",
         "stop of a spectrum": "Studio shows nothing of it",
     }

@@ -113,6 +113,7 @@ class StudioActivity(Activity):
         self._session, self._files, self._place = session, files, place
         self._folder, self._scan_time = folder, scan_time
         self._by_hand, self._is_short = "", False
+        self._started = 0
         self._kept = kept
         if what := kept.pop("call", ""):
             # Studio reports the end of a command only on the connection of this command
@@ -121,7 +122,13 @@ class StudioActivity(Activity):
 
     def status(self) -> ScopeStatus:
         """Return the present state. Register measurements that began or ended, and take a curve that awaits the tip."""
-        scanning = self._session.scanning().running
+        seen = self._session.scanning()
+        scanning, running = seen.running, self._files.running
+        if running is not None and running["what"] == SCAN and seen.started > running["started"]:
+            # between two looks it was stopped at the panel and another one begun, which may be over as well
+            scanning = True
+            self.follow("")
+        self._started = seen.started
         call = self._running_call()
         curve = call is not None and call.what == FORCE
         if self._stopping and curve:
@@ -149,6 +156,7 @@ class StudioActivity(Activity):
             return
         time, now_s = self._scan_time(), self._clock.now_s()
         facts = {"lines": [time.lines, time.line_s], "begun_s": now_s, "first_s": None, "seen_s": now_s}
+        facts["started"] = self._started
         self._files.begin(what, self._folder(), {"frame": as_list(time.region), **facts})
         self._files.see_frame(time.region)
 
@@ -206,6 +214,7 @@ class StudioActivity(Activity):
         """
         # A short scan may be over before the next poll: then the count of started scans has risen.
         before = self._session.scanning().started
+        self._started = before + 1
 
         def is_seen() -> bool:
             seen = self._session.scanning()

@@ -34,14 +34,16 @@ WATCH: Final = f"""
 if not afspm_seen then
   afspm_seen = {{scanning = false, started = 0}}
   {WORKFLOW}.{STARTED}.connect(function()
+    if not afspm_seen.scanning then afspm_seen.started = afspm_seen.started + 1 end
     afspm_seen.scanning = true
-    afspm_seen.started = afspm_seen.started + 1
   end)
   {WORKFLOW}.{FINISHED}.connect(function() afspm_seen.scanning = false end)
 end
 return {WORKFLOW}.{STARTED}.empty()
 """
-"""Connects handlers that count scans; returns true if Studio has not connected the handlers."""
+"""Connects handlers that count scans; returns true if Studio has not connected the handlers.
+
+A start without an end before it counts as the same scan, such as one that goes on after a pause."""
 
 MISSING: Final = """
 local missing = {}

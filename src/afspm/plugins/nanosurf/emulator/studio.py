@@ -177,7 +177,7 @@ class StudioProgram(MakerProgram):
         self._item_name = "Image"
         self._grid: CurveGrid | None = None
         self._calibrated = False
-        self._signalled_scanning = False
+        self._signalled_scanning = self._was_stopped = False
         feedback = self.rig.setup.feedback
         if feedback.setpoint is not None:
             self.values[SETPOINT] = feedback.setpoint
@@ -250,10 +250,19 @@ class StudioProgram(MakerProgram):
         if self.when_advanced(now_s):
             again_s = super().advance(now_s)
             self._go_on_with_grid(now_s)
-        if self.scanning is not self._signalled_scanning:
-            self._signalled_scanning = self.scanning
-            self.on_signal("scanning_started" if self.scanning else "scanning_finished")
+        # a stop and a start since the last advance are two signals
+        if self._signalled_scanning and (self._was_stopped or not self.scanning):
+            self._signalled_scanning = False
+            self.on_signal("scanning_finished")
+        if self.scanning and not self._signalled_scanning:
+            self._signalled_scanning = True
+            self.on_signal("scanning_started")
+        self._was_stopped = False
         return again_s
+
+    def stop_scan(self, now_s: float) -> None:
+        super().stop_scan(now_s)
+        self._was_stopped = True
 
     @property
     def measuring_curve(self) -> bool:
