@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib import import_module
 from multiprocessing import get_context
 from pathlib import Path
@@ -61,6 +62,7 @@ WAITS_S: Final = 30.0
 """How long the run waits for a microscope that is not free, or for a measurement that does not end: real seconds."""
 DELAYS_MS: Final = (0, 5, 20, 50, 100)
 _OFF_AGAIN_S: Final = 0.03
+_PAUSED_S: Final = 0.3
 _BRIEF_S: Final = 0.3
 """No reading of the run sees what a person has put right so soon after an end."""
 _MATCHES: Final = 0.02
@@ -86,6 +88,7 @@ class Panel:
         turn, shown: set that value, and return it as the panel shows it.
         feedback: switches the z feedback; None: the maker does not show it.
         withdraw: None: the maker does not show the tip.
+        pause: pauses the scan, or lets it go on; None: not tried.
     """
 
     turn: Callable[[Any, float], object]
@@ -95,6 +98,7 @@ class Panel:
     move_frame: Hand
     feedback: Callable[[Any, bool], object] | None = None
     withdraw: Hand | None = None
+    pause: Callable[[Any, bool], object] | None = None
     value: str = names.TIP_BIAS_VOLTAGE
     values: tuple[float, ...] = (0.12, 0.16, 0.2, 0.24, 0.28, 0.32)
     by_hand: float = 0.45
@@ -165,6 +169,10 @@ def _move_park(emulator: Any) -> None:
     emulator.program.ask("call", "scan.setScanGeometry", [{"offsetX": x_um + ASIDE_M * 1e6}])
 
 
+def _pause_nanosurf(emulator: Any, on: bool) -> None:
+    (emulator.program.pause if on else emulator.program.resume)(_now_s(emulator))
+
+
 def _move_nanosurf(emulator: Any) -> None:
     path = "imaging.frame_center_offset_x"
     emulator.program.put(path, emulator.program.values[path] + ASIDE_M)
@@ -211,6 +219,7 @@ PANELS: Final = {
         stop=_stop_program,
         start=_start_program,
         move_frame=_move_nanosurf,
+        pause=_pause_nanosurf,
         value=names.ZCTRL_SETPOINT,
         values=(0.5, 0.55, 0.6, 0.65, 0.7, 0.75),
         by_hand=0.4,
@@ -333,10 +342,11 @@ class Case:
 
 
 def acts_of(maker: str) -> tuple[str, ...]:
-    """Return what a person can do at a maker's panel, as far as the maker shows it."""
+    """Return what a person can do at a maker's panel, of feedback and tip as far as the maker shows them."""
     panel = PANELS[maker]
     feedback = ("off", "off and on") if panel.feedback else ()
-    return (*feedback, *(("withdraw",) if panel.withdraw else ()), "value", "stop", "own", "frame", "replace")
+    more = (("withdraw", panel.withdraw), ("pause", panel.pause))
+    return (*feedback, *(act for act, hand in more if hand), "value", "stop", "own", "frame", "replace")
 
 
 # --- the truth ---
@@ -481,8 +491,7 @@ class Person:
         """Act after some real time."""
         if self._is_armed:
             self._is_armed = False
-            self._timers.append(Timer(max(delay_s, 0.0), self._queue))
-            self._timers[-1].start()
+            self._after(max(delay_s, 0.0), partial(self._do, self._made.emulator))
 
     def rest(self) -> None:
         """Do nothing any more."""
@@ -505,8 +514,12 @@ class Person:
                     self._is_armed = False
                     self._do(self._made.emulator)
 
-    def _queue(self) -> None:
-        self._made.emulator.to_do.put(lambda: self._do(self._made.emulator))
+    def _after(self, delay_s: float, hand: Callable[[], object]) -> None:
+        self._timers.append(Timer(delay_s, self._queue, [hand]))
+        self._timers[-1].start()
+
+    def _queue(self, hand: Callable[[], object]) -> None:
+        self._made.emulator.to_do.put(hand)
         self._made.emulator.woken.post()
 
     def _do(self, emulator: Any) -> None:
@@ -529,8 +542,11 @@ class Person:
             assert panel.feedback is not None
             panel.feedback(emulator, False)
             if act == "off and on":
-                self._timers.append(Timer(_OFF_AGAIN_S, self._queue_on))
-                self._timers[-1].start()
+                self._after(_OFF_AGAIN_S, partial(panel.feedback, emulator, True))
+        elif act == "pause":
+            assert panel.pause is not None
+            panel.pause(emulator, True)
+            self._after(_PAUSED_S, partial(panel.pause, emulator, False))
         elif act == "withdraw":
             assert panel.withdraw is not None
             panel.withdraw(emulator)
@@ -546,12 +562,6 @@ class Person:
                 before = len(self._truth.taken)
                 panel.start(emulator)
                 self._truth.person_starts = len(self._truth.taken) == before  # it begins after a ramp
-
-    def _queue_on(self) -> None:
-        feedback = self._panel.feedback
-        assert feedback is not None
-        self._made.emulator.to_do.put(lambda: feedback(self._made.emulator, True))
-        self._made.emulator.woken.post()
 
 
 # --- the run ---
@@ -809,7 +819,7 @@ def judged(run: Run, case: Case) -> Verdict:
     ends = [truth.at(one.end_s) for one in after]
     spoiled = any(not (look.on and look.engaged) for look in ends)
     stopped = any(not one.is_complete for one in after) or any(one.by_hand for one in after)
-    trace = {"off and on": spoiled, "stop": stopped, "own": stopped, "replace": stopped}.get(
+    trace = {"off and on": spoiled, "pause": False, "stop": stopped, "own": stopped, "replace": stopped}.get(
         case.act, acted_s is not None
     )
     return Verdict(
@@ -1009,7 +1019,7 @@ def table(verdicts: Sequence[Verdict]) -> str:
     """Return the counts by maker and kind of act."""
     lines = [
         "| maker | act | cases | acts | with a trace | wrong results | told | apart | errors |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     groups: dict[tuple[str, str], list[Verdict]] = {}
     for one in verdicts:
