@@ -29,6 +29,7 @@ from afspm.plugins.gxsm import Gxsm
 from afspm.plugins.nanonis import Nanonis
 from afspm.plugins.nanonis import session as nanonis
 from afspm.plugins.nanosurf import Nanosurf
+from afspm.plugins.nanosurf import link as nanosurf
 from afspm.plugins.park import Park
 from afspm.testing.commissioning import maker_claims
 from afspm.testing.commissioning.guide import NO_PANEL, Guide
@@ -436,7 +437,7 @@ def address(folder: Path) -> str:
     return found[1]
 
 
-@pytest.mark.parametrize("vendor", ["Nanonis", "Asylum"])
+@pytest.mark.parametrize("vendor", ["Nanonis", "Asylum", "Nanosurf"])
 def test_a_scan_that_the_person_stops_at_the_panel_ends_no_control(vendor: str, tmp_path: Path) -> None:
     def do(function: str, *arguments: str | int) -> Callable[[], str]:
         def press() -> str:
@@ -445,6 +446,8 @@ def test_a_scan_that_the_person_stops_at_the_panel_ends_no_control(vendor: str, 
                 igor = asylum.Link(f"tcp://{at}", DEADLINE_S, time.monotonic)
                 igor.ask(function, *arguments)
                 igor.close()
+            elif vendor == "Nanosurf":
+                at_studio(at, "imaging.stop")
             else:
                 link = nanonis.Link(("127.0.0.1", int(at.rpartition(":")[2])), DEADLINE_S, time.monotonic)
                 link.ask(function, *arguments)
@@ -460,6 +463,35 @@ def test_a_scan_that_the_person_stops_at_the_panel_ends_no_control(vendor: str, 
     lines = {name: f"{one.outcome.value}: {one.line}" for name, one in result.progress.results.items()}
     assert lines["stop-at-panel"] == "passed: noticed, and no scan was published", lines
     assert result.passed, (result.lost, lines)
+
+
+def at_studio(at: str, command: str) -> None:
+    """Press a button of the emulated Studio."""
+    studio = nanosurf.Link(at, DEADLINE_S, time.monotonic)
+    try:
+        (sessions,) = studio.run("root.session.select_main(0) return root.session.list()")
+        studio.run(f'return root.session.select("{sessions[1]}", 1)')
+        studio.run(f"root.workflow.{command}() return 0")
+    finally:
+        studio.close()
+
+
+# makers C2: Studio shows nothing of it
+def test_tip_of_nanosurf_withdrawn_when_the_step_asks_for_it_breaks_nothing_off(tmp_path: Path) -> None:
+    questions: list[str] = []
+
+    def withdraw() -> str:
+        questions.append("withdraw")
+        at_studio(address(tmp_path), "approach.withdraw")
+        return "y"
+
+    person = Person({"scanner can't reach it": withdraw, "Is the tip at the sample": False})
+    result = commissioned(tmp_path, "Nanosurf", person)
+    lines = {name: f"{one.outcome.value}: {one.line}" for name, one in result.progress.results.items()}
+    assert not result.lost
+    assert questions == ["withdraw"]
+    assert lines["withdrawn"].startswith("passed: on your word alone: "), lines
+    assert lines["stop"].startswith("passed"), lines
 
 
 def at_nanonis(folder: Path, function: str, *arguments: object) -> tuple[Any, ...]:
