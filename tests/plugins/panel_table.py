@@ -219,6 +219,7 @@ PANELS: Final = {
         NanosurfBench,
         {
             "Stop": partial(press, button="stop_scan"),
+            "Start": partial(press, button="start_scan"),
             _WITHDRAW: partial(press, button="withdraw"),
             "frame": _studio("imaging.frame_center_offset_x", 90e-9),
         },
