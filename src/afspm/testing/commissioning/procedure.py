@@ -210,6 +210,7 @@ class _Walk:
         try:
             kit.client.come_to_rest()
             kit.act(names.RETRACT)
+            kit.is_withdrawn = True
             kit.client.settled(kit.client.observations.mark())
             shown = kit.client.ask(ControlRequest.PARAM, Parameter(names.ENGAGED))
             if shown.ok:

@@ -175,6 +175,7 @@ class CheckMeasurements:
         complaints: logged warnings and errors; the list grows.
 
     Attributes:
+        is_withdrawn: whether the tip was withdrawn at the end, and stays so.
         frames: the frames to scan; raises Skipped if the microscope has not published its frame.
     """
 
@@ -192,6 +193,7 @@ class CheckMeasurements:
         self._excused, self._complaints = excused, complaints
         self._heeded = len(complaints)
         self._kept: dict[str, Taken | Skipped] = {}
+        self.is_withdrawn = False
         self._checked = ""
         initial = client.observations.newest(ScanParameters)
         region = None if initial is None else initial.region

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from afspm.model import ControlRequest, Feedback, Parameter, ProbePosition, Region, ScanParameters, names
 from afspm.testing.conformance import CheckResult, Failed, Lost, near
@@ -19,7 +19,7 @@ _LAST = (names.SCAN_SPEED, names.MOVE_SPEED)
 """Settings restored last, since a change of the frame may change them."""
 _REPORTED = (
     names.CONTROLLER, names.SAFE_TIP_ON, names.SAFE_TIP_THRESHOLD, names.TIP_Z, names.CURRENT, names.FREQUENCY_SHIFT,
-    names.Z_IS_HELD,
+    names.Z_IS_HELD, names.ENGAGED,
 )  # fmt: skip
 """Parameters that are measured, or that a person may change meanwhile: no request can set them."""
 
@@ -45,8 +45,13 @@ class SettingsBefore:
             support,
         )
 
-    def restore(self, client: CheckClient) -> list[str]:
+    def restore(self, client: CheckClient, *, is_away: bool = False) -> list[str]:
         """Stop a running scan or spectrum, and restore all settings.
+
+        The feedback is left as it is with a tip that is away: switched on, it would bring the tip to the sample again.
+
+        Args:
+            is_away: whether the tip was withdrawn; otherwise the controller is asked.
 
         Returns:
             the failures, one per line.
@@ -55,25 +60,30 @@ class SettingsBefore:
         try:
             client.quiet()
             client.come_to_rest()
-            self._put_back_together(client, wrong)
+            is_away = is_away or (self.support.has(names.ENGAGED) and client.get(names.ENGAGED).value == "false")
+            self._put_back_together(client, wrong, is_away=is_away)
             ordered = sorted(self.parameters, key=lambda name: name in _LAST)
             for name in ordered:
-                self._put_back(client, name, wrong)
+                if not (is_away and name == names.FEEDBACK_ON):
+                    self._put_back(client, name, wrong)
         # listed in the report instead of raised: the results of the checks must not get lost
         except (Lost, Failed) as error:
             wrong.append(str(error))
         return wrong
 
-    def _put_back_together(self, client: CheckClient, wrong: list[str]) -> None:
+    def _put_back_together(self, client: CheckClient, wrong: list[str], *, is_away: bool) -> None:
         # settings of one packet are restored in one request: one by one, they would pass through invalid combinations
         observations = client.observations
+        feedback, in_force = self.feedback, observations.newest(Feedback)
+        if is_away and feedback is not None:
+            feedback = replace(feedback, on=None if in_force is None else in_force.on)
         settings = (
             (ControlRequest.SET_SCAN_PARAMS, observations.newest(ScanParameters), self.frame, self._frame()),
             (
                 ControlRequest.SET_ZCTRL_PARAMS,
-                observations.newest(Feedback),
-                self.feedback,
-                _changed(self.feedback, observations.newest(Feedback)),
+                in_force,
+                feedback,
+                _changed(feedback, in_force),
             ),
             (ControlRequest.SET_PROBE_POS, observations.newest(ProbePosition), self.probe, self.probe),
         )
@@ -128,7 +138,7 @@ def restored(session: CheckSession, report: CheckReport) -> Iterator[CheckMeasur
     try:
         yield kit
     finally:
-        report.unrestored = before.restore(session.client)
+        report.unrestored = before.restore(session.client, is_away=kit.is_withdrawn)
 
 
 def run(
