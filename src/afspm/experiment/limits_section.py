@@ -124,6 +124,7 @@ class LimitsReader:
         actions: known actions; None if they can't be known before the microscope runs.
         sets: parameters that an action sets, by the action's name.
         certain: whether `parameters` has all parameters, or only the base parameters and afspm's extensions.
+        lacking: known parameters that the microscope does not have.
         instruments: parameters of each other instrument, whose units are known only when the instrument runs.
         types: "bool" or "text" for parameters that are no numbers.
         bias: the reference of the bias; limits on `sample-bias` become limits on `tip-bias-voltage`.
@@ -138,6 +139,7 @@ class LimitsReader:
     certain: bool
     instruments: Mapping[str, Collection[str]] = field(default_factory=dict)
     types: Mapping[str, str] = field(default_factory=dict)
+    lacking: frozenset[str] = frozenset()
     bias: BiasReference = field(default_factory=BiasReference)
     coarse: Mapping[str, CoarseMove] = field(default_factory=dict)
 
@@ -214,6 +216,9 @@ class LimitsReader:
             self.document.error(f"[limits] there is no parameter {name!r}", "limits", name, hint=hint)
             return None
         path = ("limits", name)
+        if name in self.lacking:
+            what = f"[limits.{name}] bounds nothing: this microscope has no such parameter"
+            self.document.warning(what, *path, hint="leave it out, or limit what the microscope has")
         fields = self._table(table, path, _OF_PARAMETER)
         if fields is None:
             return None

@@ -137,6 +137,7 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
         sets={} if has is None else has.sets,
         certain=has is not None,
         coarse={} if has is None else has.coarse,
+        lacking=frozenset() if has is None else frozenset(names.BASE_PARAMETERS) - has.parameters.keys(),
         types={}
         if has is None
         else {name: has.table[name].type for name in has.table if not has.table[name].is_number},
