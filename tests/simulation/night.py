@@ -207,13 +207,16 @@ def bad_night(seed: int) -> Plan:
     return replace(slow, faults=faults, dies_in_step=0.003, doubles=0.1, hangs=0.005)
 
 
+def ends_in_danger(seed: int, *, is_frozen: bool) -> Plan:
+    """Return a night that ends while the tip is in danger, also while the translator does not answer."""
+    faults = (Fault("freeze", "translator", 0.98, 14.0),) if is_frozen else ()
+    return Plan(seed, 2.0, cast=("experiment", "person", "careless"), lease_s=None, ends=True, faults=faults)
+
+
 FINDERS = [
     *map(bad_night, (9, 14, 11, 5, 13, 6, 0, 3, 18, 35)),
-    *(
-        Plan(5, 2.0, cast=("experiment", "person", "careless"), lease_s=None, ends=True, faults=faults)
-        # they end while the tip is in danger, the first while the translator does not answer
-        for faults in ((Fault("freeze", "translator", 0.98, 14.0),), ())
-    ),
+    ends_in_danger(3, is_frozen=True),
+    ends_in_danger(5, is_frozen=False),
     Plan(6, 5.0, cast=("experiment", "freezer"), lease_s=None),
 ]
 """The nights in which all mutants of the scheduler are found, those that find most first.
@@ -238,8 +241,8 @@ def panel_night(seed: int) -> Plan:
     return replace(plan(seed, hours=4.0), panel=maker, acts=(2.0, 10.0)[seed % 2], repeats=repeats)
 
 
-PANEL_NIGHTS = [*_PANEL_NIGHTS, panel_night(199), panel_night(449)]
-"""One night for each maker, with a person at its panel; in two more the scheduler's own actions wait meanwhile."""
+PANEL_NIGHTS = [*_PANEL_NIGHTS, panel_night(200)]
+"""One night for each maker, with a person at its panel; in one more the scheduler's own actions wait meanwhile."""
 
 
 @dataclass

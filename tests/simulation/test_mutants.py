@@ -39,7 +39,7 @@ from tests.simulation.forbidden_bench import SCENARIOS, ForbiddenBench
 from tests.simulation.forbidden_mutants import MUTANTS as FORBIDDEN_MUTANTS
 from tests.simulation.invariants import InvariantViolated
 from tests.simulation.microscope import GARBLED
-from tests.simulation.night import FINDERS, PANEL_NIGHTS, Night, bad_night, panel_night
+from tests.simulation.night import FINDERS, PANEL_NIGHTS, Night, bad_night, ends_in_danger, panel_night
 
 pytestmark = pytest.mark.slow
 Patch = pytest.MonkeyPatch
@@ -432,7 +432,8 @@ _FURTHER_NIGHTS = 60
 
 def _nights() -> None:
     # first the nights of `make test`: which mutants these find, `make test` finds; `make simulate` has the others
-    for night in (*FINDERS, *map(bad_night, range(100, 100 + _FURTHER_NIGHTS))):
+    in_danger = (ends_in_danger(seed, is_frozen=True) for seed in range(10, 30))
+    for night in (*FINDERS, *in_danger, *map(bad_night, range(100, 100 + _FURTHER_NIGHTS))):
         Night(night).run()
 
 
@@ -485,7 +486,7 @@ def test_actions_that_are_not_saved_are_found_in_sample_coordinates(monkeypatch:
     """Where the sample moves, a repeated action is sent to another place: to a translator it is a new one."""
 
     def nights() -> None:
-        for seed in (3, 10):
+        for seed in (0, 6):
             DriftNight(bad_night(seed)).run()
 
     nights()

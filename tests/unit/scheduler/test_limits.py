@@ -20,6 +20,7 @@ from afspm.model import (
     RegionChange,
     Request,
     ScanParameters,
+    names,
 )
 from afspm.model.scan import ShapeChange
 from afspm.model.snapshot import from_plain, to_plain
@@ -268,6 +269,18 @@ def test_scan_outside_the_region_is_refused_even_if_set_at_the_panel() -> None:
     g.in_force(ScanParameters(Region((4e-6, 0), (1e-6, 1e-6)), (8, 8)), 0)
     assert here(g, "start-scan") == ""
     assert here(checker(), "start-scan") == ""
+
+
+@pytest.mark.parametrize("action", ["start-scan", "start-spec", "x-pulse", "x-crash"])
+def test_measurement_with_a_bias_beyond_its_range_is_refused_though_no_request_has_set_it(action: str) -> None:
+    g = guard(tip_bias_voltage=Limit(-2.0, 2.0, source="toml:9"))
+    assert names.TIP_BIAS_VOLTAGE in g.depends_on(act(action))
+    assert g.depends_on(act("stop-scan")) == g.depends_on(act("x-retract")) == []
+    for bias, refused in (("8", True), ("2", False)):
+        read = (Parameter(names.TIP_BIAS_VOLTAGE, bias, "V"), Parameter(names.SPEC_KIND, "force"))
+        g.was_read({one.name: one for one in read}, 0)
+        assert ("toml:9" in here(g, action)) is refused
+        assert here(g, "stop-scan") == here(g, "x-retract") == ""
 
 
 @pytest.mark.parametrize("action", ["start-spec", "x-pulse", "x-crash"])

@@ -64,11 +64,16 @@ _TREATMENTS = {
     names.CRASH: (names.CRASH_DEPTH, names.CRASH_SPEED),
 }
 """The parameters that a treatment of the tip uses as they are in force."""
+_IN_FORCE = (
+    names.TIP_BIAS_VOLTAGE, names.SAMPLE_BIAS, names.ZCTRL_SETPOINT, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN,
+    names.SCAN_SPEED,
+)  # fmt: skip
+"""The settings with which a measurement or treatment takes place; no request of the run may have set them."""
 _OF_BIAS_CURVES = frozenset((*names.SPEC_ENDS, names.SPEC_Z_OFFSET, names.LOCK_IN_AMPLITUDE))
 _OF_HEIGHT_CURVES = frozenset((*names.SPEC_Z_ENDS, names.LOCK_IN_AMPLITUDE))
 _OF_CURVES = _OF_BIAS_CURVES | _OF_HEIGHT_CURVES
 """The values that limits judge right before a curve, by the swept quantity."""
-_READ_FOR_ACTIONS = _OF_CURVES.union(*_TREATMENTS.values())
+_READ_FOR_ACTIONS = _OF_CURVES.union(*_TREATMENTS.values(), _IN_FORCE)
 
 
 class _Breach(Exception):
@@ -127,8 +132,7 @@ class LimitChecker:
         return None
 
     def check_place(self, request: Request) -> Response | None:
-        """Return the refusal of an action at the present place, or of a treatment or curve as it is set; None: it may
-        start.
+        """Return the refusal of an action at the present place, or with the settings in force; None: it may start.
 
         A person may have changed both.
         """
@@ -139,13 +143,13 @@ class LimitChecker:
         return self.check_values(request)
 
     def check_values(self, request: Request) -> Response | None:
-        """Return the refusal of a treatment of the tip or a curve with the values in force; None: it may start."""
+        """Return the refusal of a measurement or a treatment with the values in force; None: it may start."""
         if self._is_curve(request):
             try:
                 self._check_curve()
             except _Breach as breach:
                 return _action_error(request, breach)
-        for name in _TREATMENTS.get(str(request.subject), ()):
+        for name in _used_by(request):
             limit, known = self.limits.parameters.get(name), self.state.usage.known.get(name)
             if limit is None or known is None:
                 continue
@@ -201,12 +205,10 @@ class LimitChecker:
         """
         parameters = self.names_set_by(request)
         needed = [name for name in parameters if name in self.limits.bounded]
-        if request.kind == ControlRequest.ACTION:
-            limited = self.limits.parameters
-            of_action = _TREATMENTS.get(str(request.subject), ())
-            needed += [name for name in of_action if name in limited and limited[name].is_of_a_number]
-            if self._is_curve(request):
-                needed += self._ends_to_read()
+        limited = self.limits.parameters
+        needed += [name for name in _used_by(request) if name in limited and limited[name].is_of_a_number]
+        if self._is_curve(request):
+            needed += self._ends_to_read()
         if self.state.movers.is_unproved and (request.subject in movers.MEASURES or self._switches_on(request)):
             needed += movers.SIGNAL
         if self.limits.region is not None or is_mapped:
@@ -699,6 +701,13 @@ def _unproved(settings: MoverSettings) -> str:
 def _error_of(request: Request) -> ControlResponse:
     is_action = request.kind == ControlRequest.ACTION
     return ControlResponse.ACTION_ERROR if is_action else ControlResponse.PARAM_ERROR
+
+
+def _used_by(request: Request) -> tuple[str, ...]:
+    # the parameters that an action uses as they are in force
+    action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
+    is_at_sample = action in (names.START_SCAN, names.START_SPEC, *names.TREATMENTS)
+    return (*_TREATMENTS.get(action, ()), *(_IN_FORCE if is_at_sample else ()))
 
 
 def _action_error(request: Request, breach: _Breach) -> Response:
