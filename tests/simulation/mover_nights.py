@@ -204,13 +204,17 @@ def judged(folder: Path) -> MoverNight:
 
 
 def _in_air(lines: list[dict[str, Any]]) -> int:
-    found, moved_s, landed = 0, -math.inf, {"time_s": -math.inf, "seems": False}
+    found, moved_s, away_s, landed = 0, -math.inf, -math.inf, {"time_s": -math.inf, "seems": False}
     for line in sorted(lines, key=lambda line: float(line["time_s"])):
         match line["event"]:
             case "coarse":
                 moved_s = line["time_s"]
             case "landed":
                 landed = line
+            case "conditions" if not line["engaged"]:
+                away_s = line["time_s"]
+            case "conditions" if landed["time_s"] < away_s:  # a person has engaged without the motor, within reach
+                landed = {"time_s": line["time_s"], "seems": False}
             case "scan starts" if moved_s > -math.inf:
                 is_proved = moved_s < landed["time_s"] <= line["time_s"] - PROVED_AFTER_S and not landed["seems"]
                 found += not is_proved

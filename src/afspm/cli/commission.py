@@ -70,6 +70,8 @@ def commission(
     ended = walk(options, terminal, file, tried_on, before, only=only)
     if ended.lost:
         terminal.show(f"not completed: {ended.lost}")
+    for line in ended.progress.not_done():
+        terminal.show(line)
     terminal.show(f"\nthe report: {file}")
     to_send = file.with_name(f"{file.stem}-to-send")
     try:
@@ -108,7 +110,7 @@ class Terminal:
         return self._line(f"{question}: ")
 
     def choose(self, question: str, options: Sequence[str], default: str = "") -> str:
-        """Ask for one of the options, by number or word; an empty answer means the default, if there is one.
+        """Ask for one of the options, by number, word or its beginning; an empty answer is the default, if any.
 
         Raises:
             KeyboardInterrupt: no valid answer after several attempts, or the end of the input.
@@ -118,9 +120,10 @@ class Terminal:
             numbered += f"; Enter: {default}"
         for _ in range(_TRIES):
             answer = self._line(f"{question} [{numbered}] ").strip().casefold() or default
-            chosen = options[int(answer) - 1] if answer.isdecimal() and 0 < int(answer) <= len(options) else answer
-            if chosen in options:
-                return chosen
+            if answer.isdecimal() and 0 < int(answer) <= len(options):
+                return options[int(answer) - 1]
+            if len(chosen := [one for one in options if answer and one.startswith(answer)]) == 1:
+                return chosen[0]
             self.show(f"  {answer!r} is none of them: type a number from 1 to {len(options)}, or the word")
         self.show(f"  no choice after {_TRIES} answers: ended")
         raise KeyboardInterrupt

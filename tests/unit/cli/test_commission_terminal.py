@@ -27,13 +27,17 @@ def typed(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     assert not lines, "more was typed than was asked"
 
 
-@pytest.mark.parametrize(("line", "chosen"), [("2", "down"), ("down", "down"), (" Up ", "up"), ("", "unseen")])
-def test_option_is_chosen_by_number_by_word_or_by_enter(typed: list[str], line: str, chosen: str) -> None:
+@pytest.mark.parametrize(
+    ("line", "chosen"), [("2", "down"), ("down", "down"), (" Up ", "up"), ("d", "down"), ("", "unseen")]
+)
+def test_option_is_chosen_by_number_by_word_by_its_beginning_or_by_enter(
+    typed: list[str], line: str, chosen: str
+) -> None:
     typed.append(line)
     assert Terminal().choose("Where to?", WAYS, "unseen") == chosen
 
 
-@pytest.mark.parametrize("wrong", ["4", "0", "²", "sideways", "-1"])
+@pytest.mark.parametrize("wrong", ["4", "0", "²", "sideways", "-1", "u"])
 def test_invalid_choice_is_refused_in_words_and_asked_again(
     typed: list[str], wrong: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -139,5 +139,20 @@ def test_step_for_claims_alone_is_not_asked_for_without_a_claim() -> None:
         Guide(kit, Person(), Path(), claims=CLAIMS).perform(step)
 
 
+@pytest.mark.parametrize(("sees", "verdict"), [("yes", "holds"), ("", "not shown"), ("no", "not shown")])
+def test_what_the_person_does_not_see_at_the_panel_passes_and_settles_nothing(sees: str, verdict: str) -> None:
+    step = CommissioningStep(
+        name="frame", title="", do=lambda guide: guide.require_at_panel("Stopped?", "a stop"), explained="", moves=False
+    )
+    kit: Any = SimpleNamespace(support=Support({}, {}))
+    guide = Guide(kit, Person(sees=sees), Path(), claims=CLAIMS)
+    if sees == "no":
+        with pytest.raises(Failed, match="the person says no"):
+            guide.perform(step)
+    else:
+        guide.perform(step)
+    assert maker_claims.verdicts(CLAIMS, "frame", guide.seen, guide.unprepared)["whole"] == verdict
+
+
 def test_step_without_a_panel_settles_nothing_that_the_panel_shows() -> None:
     assert set(settled(Person("Switch it on", "up"), has_panel=False).values()) == {"not shown"}

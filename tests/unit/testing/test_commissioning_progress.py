@@ -65,6 +65,13 @@ def test_worst_outcome_of_an_operation_counts_and_nothing_left_out_hides_a_pass(
     assert progress.operations() == {"scan": "mismatch"}
 
 
+def test_steps_without_a_pass_are_named_with_the_blocked_ones() -> None:
+    progress = CommissioningProgress(STEPS)
+    walk(progress, {"gate": CheckOutcome.DECLINED})
+    assert progress.not_done() == ["declined: gate", "not tried, since they need those: scan, late"]
+    assert CommissioningProgress(STEPS).not_done() == []
+
+
 def test_nothing_acts_on_the_microscope_before_the_tip_is_withdrawn() -> None:
     steps = {one.name: one for one in all_steps()}
 

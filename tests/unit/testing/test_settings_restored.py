@@ -51,7 +51,7 @@ def test_feedback_stays_off_with_a_tip_that_was_withdrawn(
     engaged: str | None, is_away: bool, is_switched_on: bool
 ) -> None:
     client: Any = Controller(engaged)
-    shown = {} if engaged is None else {names.ENGAGED: Parameter(names.ENGAGED, engaged)}
+    shown: dict[str, Parameter | None] = {} if engaged is None else {names.ENGAGED: Parameter(names.ENGAGED, engaged)}
     parameters = {name: Parameter(name, value) for name, value in VALUES.items()}
     support = Support({}, shown)
     before = SettingsBefore(None, Feedback(on=True, setpoint=2e-10), None, dict(parameters), support)

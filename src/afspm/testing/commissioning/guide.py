@@ -164,13 +164,17 @@ class Guide:
             raise Failed(expected, "the person says no")
 
     def require_at_panel(self, question: str, expected: str) -> None:
-        """Ask the person to confirm at the panel, if there is one.
+        """Ask the person to confirm at the panel, if there is one; what can't be seen there settles nothing.
 
         Raises:
             Failed: the person says no.
         """
-        if self._can_be_seen(question):
-            self.require(question, expected)
+        if not self._can_be_seen(question):
+            return
+        seen = self.prompts.choose(question, ("yes", "no", UNSEEN), UNSEEN)
+        self._is_unseen |= seen == UNSEEN
+        if seen == "no":
+            raise Failed(expected, "the person says no")
 
     def at_panel(self, question: str) -> str | None:
         """Ask for a line of text about the panel; return None without a panel."""

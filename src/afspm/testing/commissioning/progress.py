@@ -106,6 +106,19 @@ class CommissioningProgress:
         found = [result.outcome for result in self.results.values()]
         return bool(found) and all(one in _GOES_ON for one in found)
 
+    def not_done(self) -> list[str]:
+        """Return which steps did not pass, and which ones they blocked, a line for each outcome."""
+        found = {
+            outcome: [step.name for step in self.steps if self._outcome(step.name) is outcome]
+            for outcome in (CheckOutcome.FAILED, CheckOutcome.DECLINED, CheckOutcome.BLOCKED)
+        }
+        said = {
+            CheckOutcome.FAILED: "failed",
+            CheckOutcome.DECLINED: "declined",
+            CheckOutcome.BLOCKED: "not tried, since they need those",
+        }
+        return [f"{said[outcome]}: {', '.join(steps)}" for outcome, steps in found.items() if steps]
+
     def operations(self) -> dict[str, str]:
         """Return the outcome of each operation of the matrix: the worst outcome of its steps.
 
