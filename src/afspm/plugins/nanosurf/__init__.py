@@ -136,6 +136,7 @@ class Nanosurf(ScriptedDriver[Session, StudioActivity]):
         self.close()
         session = self._session = Session(self._open_link, self._release, self._session_name, self._level)
         self.prove()
+        self.log.info("%s", session.controller)
         if self.lacking:
             text = "before Studio %d curves of force and positions of the tip are not supported: %s"
             self.log.warning(text, commands.WITH_THIS_TREE, commands.LACKING)
