@@ -39,7 +39,7 @@ def asked(
         what = f"{kind.__name__} has no shadow, a driver that only reads: its controller is not asked"
         return None, [Diagnosis("controller", Severity.WARNING, kind.__name__, what, "see docs/how-to/shadow.md")]
     try:
-        driver = class_loader.load(kind.shadow)(**settings)
+        driver = class_loader.load(kind.shadow).once(**settings)
     except AfspmError as error:
         what = f"its controller is not asked: {error.what}"
         return None, [Diagnosis("controller", Severity.WARNING, kind.__name__, what, error.hint)]

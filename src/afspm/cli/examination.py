@@ -79,10 +79,12 @@ def examine(
     """
     examination = Examination([] if experiment is None else [*_file(experiment)])
     examination.found += diagnosis.of_packages(entry_points.inventory(commands))
-    if experiment is not None and diagnosis.is_well(examination.found):
-        kind, settings = experiment.resolved.driver()
+    is_right = diagnosis.is_well(examination.found)
+    if experiment is not None and (is_right or not experiment.resolved.with_role(Role.SCHEDULER)):
+        kind, settings = experiment.resolved.driver()  # also of an instrument's file alone, which is no experiment
         if kind is not None:
             examination.found += contacting.asked(kind, settings, everything=everything)[1]
+    if experiment is not None and is_right:
         examination.found += _keys(experiment)
         _Connections(experiment, examination).examine(listen_s)
         examination.found += _devices(experiment)

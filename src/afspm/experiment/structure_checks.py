@@ -89,7 +89,9 @@ def check_roles(resolved: ResolvedExperiment) -> None:
         if not having and (name := _not_a_component(resolved, role)):
             resolved.document.error(f"there is no {role.value}", name, hint=f"[{name}] needs `component = true`")
         elif not having and _all_loaded(resolved):  # a class that can't be loaded may be the missing one
-            resolved.document.error(f"there is no {role.value}", hint=hint)
+            is_instrument = len(resolved.processes) == len(resolved.with_role(Role.TRANSLATOR)) > 0
+            laid_over = "; a file of an instrument is checked over an experiment: afspm check EXPERIMENT.toml THIS.toml"
+            resolved.document.error(f"there is no {role.value}", hint=hint + laid_over * is_instrument)
         for extra in having[1:]:
             what = f"[{extra.name}] is a second {role.value} beside [{having[0].name}]"
             resolved.document.error(what, extra.name, hint="one is enough")

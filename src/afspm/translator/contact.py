@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import tempfile
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -98,7 +99,9 @@ def contact(driver: DriverBase) -> Contact:
         try:
             driver.connect()
             found.connected_s = clock.monotonic_s() - began_s
-            found.identity, found.status = driver.identity, driver.status()
+            found.identity = driver.identity
+            with suppress(NotSent):  # what only handlers in the controller show
+                found.status = driver.status()
             for name, row in driver.table.items():
                 found.answers[name] = _asked(driver, name, row, clock)
             found.reach = dict(driver.reach())

@@ -312,6 +312,9 @@ class DriverBase(ABC):
     only_reads: ClassVar[bool] = False
     """True for a shadow, which only reads the controller."""
 
+    asks_once: ClassVar[bool] = False
+    """True for a shadow that only asks, and need not see when measurements begin and end."""
+
     program_s: ClassVar[float] = 0.0
     """Real seconds that the controller's program may need for work beside measuring, such as saving a file. They do not
     depend on the speed of the experiment's clock."""

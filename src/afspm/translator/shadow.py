@@ -13,7 +13,7 @@ read without a side effect is not read there.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from afspm.basics.errors import Refused
 from afspm.model import ControlResponse
@@ -32,6 +32,12 @@ class ShadowDriver(DriverBase):
     only_reads = True
     watches: ClassVar[type[DriverBase]]
     """The maker's driver, with all that a run could ask of it."""
+
+    @classmethod
+    def once(cls, **settings: Any) -> ShadowDriver:
+        """Create a shadow that only asks, and need not see when measurements begin and end."""
+        asking: type[ShadowDriver] = type(cls.__name__, (cls,), {"asks_once": True, "__module__": cls.__module__})
+        return asking(**settings)
 
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)

@@ -61,6 +61,10 @@ def test_controller_is_asked_written_down_and_run_with_what_was_read(tmp_path: P
 
     code, text = told(tmp_path, "new", "instrument", "nanonis", controller)
     assert code == 0, text
+    code, text = told(tmp_path, "doctor", "instrument.toml")  # no experiment: it is asked all the same
+    assert code == 1
+    assert "tip-bias-voltage: 100 mV (" in text
+    assert "a file of an instrument is checked over an experiment" in text
     file = tmp_path / "instrument.toml"
     limits = tomllib.loads(file.read_text(encoding="utf-8"))["limits"]
     assert limits["tip-bias-voltage"] == {"min": "-1 V", "max": "1 V", "step": "1 V"}

@@ -134,7 +134,9 @@ class Nanosurf(ScriptedDriver[Session, StudioActivity]):
 
     def connect(self) -> None:
         self.close()
-        session = self._session = Session(self._open_link, self._release, self._session_name, self._level)
+        session = self._session = Session(
+            self._open_link, self._release, self._session_name, self._level, watches=not self.asks_once
+        )
         self.prove()
         self.log.info("%s", session.controller)
         if self.lacking:

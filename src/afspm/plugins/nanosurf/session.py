@@ -47,13 +47,17 @@ class Session:
         release: release of Studio.
         name: name of the session; empty: the only open session.
         level: level of the session's commands; None: the lowest sufficient level.
+        watches: whether begin and end of measurements are needed, which some releases report only to handlers.
 
     Raises:
         ControllerLost: no connection, or no such session.
         ConfigError: Studio has another release, lacks commands, or does not report scans to scripts.
     """
 
-    def __init__(self, open_link: Callable[[], Link], release: int, name: str, level: int | None = None) -> None:
+    def __init__(
+        self, open_link: Callable[[], Link], release: int, name: str, level: int | None = None, *, watches: bool = True
+    ) -> None:
+        self._watches = watches
         self._open_link, self._release, self._name = open_link, release, name
         self._level = commands.level(release) if level is None else level
         self._old = commands.has_old_commands(release)
@@ -235,7 +239,7 @@ class Session:
             hint = "name its release (Help > About) in the setting release, and look at the level of its licence"
             raise ConfigError(f"{self.controller} has no {names}", where="release", hint=hint)
         watch = commands.WATCH_MOVES if self._is_before_this_tree else "" if self._old else commands.WATCH
-        if watch and self.run(watch)[0]:
+        if self._watches and watch and self.run(watch)[0]:
             what = "approaches" if self._is_before_this_tree else "scans"
             problem = f"{self.controller} does not report the start and end of {what} to scripts"
             raise ConfigError(problem, where="release", hint="report it, with the release, to the afspm project")

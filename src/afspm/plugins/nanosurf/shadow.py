@@ -48,7 +48,9 @@ class NanosurfShadow(ShadowDriver, Nanosurf):
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
-        if commands.is_before_this_tree(self._release) or not commands.has_old_commands(self._release):
+        if not self.asks_once and (
+            commands.is_before_this_tree(self._release) or not commands.has_old_commands(self._release)
+        ):
             problem = f"a shadow can't see what Nanosurf Studio {self._release} does without leaving handlers in it"
             raise ConfigError(problem, where="release", hint="shadows are for releases 17 and 18")
 
