@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -129,12 +130,27 @@ class Terminal:
         raise KeyboardInterrupt
 
     def _line(self, question: str) -> str:
+        _forget_typed()
         # the end of input counts as Ctrl-C: without a terminal there is no answer to wait for
         with _interruptible():
             try:
                 return input(question)
             except EOFError:
                 raise KeyboardInterrupt from None
+
+
+def _forget_typed() -> None:
+    # what was typed while afspm was busy answers no question that was not on the screen
+    if sys.stdin.isatty():
+        if sys.platform == "win32":
+            import msvcrt
+
+            while msvcrt.kbhit():
+                msvcrt.getwch()
+        else:
+            import termios
+
+            termios.tcflush(sys.stdin, termios.TCIFLUSH)
 
 
 @contextmanager

@@ -604,6 +604,19 @@ def test_wrong_order_of_rows_in_memory_is_found_while_a_scan_fills(tmp_path: Pat
     assert (result.claims["grabbed-rows"], result.claims["buffer-numbers"]) == ("does not hold", "not shown")
 
 
+def test_frame_that_the_person_has_set_at_the_panel_stays(tmp_path: Path) -> None:
+    def set_frame() -> str:
+        at_nanonis(tmp_path, "Scan.FrameSet", 1e-7, 0.0, 6e-7, 4e-7, 20.0)
+        return ""
+
+    person = Person({"when the frame is set": set_frame, "scanner can't reach it": False})
+    result = commissioned(tmp_path, "Nanonis", person)
+    assert result.progress.results["withdrawn"].outcome is CheckOutcome.DECLINED
+    assert not InstrumentReport.read(tmp_path / "report.toml").unrestored
+    exchanges = [one for one in read_trace(result.folder / FILE) if isinstance(one, TracedExchange)]
+    assert [one.what for one in exchanges if one.command] == []
+
+
 def test_safe_tip_that_is_on_is_reported_with_its_threshold(tmp_path: Path) -> None:
     def switch_on() -> str:
         at_nanonis(tmp_path, "SafeTip.OnOffSet", 1)

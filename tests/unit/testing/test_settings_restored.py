@@ -61,3 +61,14 @@ def test_feedback_stays_off_with_a_tip_that_was_withdrawn(
     assert ((names.FEEDBACK_ON, "true") in client.sent) is is_switched_on
     (feedback,) = [one for one in client.sent if isinstance(one, Feedback)]
     assert (feedback.on, feedback.setpoint) == (True if is_switched_on else None, 2e-10)
+
+
+def test_feedback_that_was_off_is_not_switched_off_with_a_tip_at_the_sample() -> None:
+    client: Any = Controller("true")
+    client.now[names.FEEDBACK_ON] = "true"
+    client.observations.newest = {Feedback: Feedback(on=True, setpoint=1e-10)}.get
+    parameters: dict[str, Parameter] = {names.FEEDBACK_ON: Parameter(names.FEEDBACK_ON, "false")}
+    support = Support({}, {names.ENGAGED: Parameter(names.ENGAGED, "true")})
+    before = SettingsBefore(None, Feedback(on=False, setpoint=1e-10), None, parameters, support)
+    assert before.restore(client) == []
+    assert client.sent == []

@@ -134,6 +134,7 @@ def _panel(guide: Guide) -> str:
     guide.prompts.text("Press Enter when the frame is set")
     _go_on(guide)
     guide.kit.client.quiet()
+    guide.kit.set_by_hand()
     count = _compare_frame(guide, frames.current_frame(guide.kit)) + _compare_values(guide)
     if not count:
         raise Skipped("the panel shows none of the values")
@@ -704,7 +705,8 @@ _PART, _PIXELS, _TURN_DEG = (0.5, 0.5), (64, 64), math.degrees(TURN_RAD)
     "afspm takes six scans: one, one moved along x, one moved along y, the first again, and two of a turned frame, and "
     "compares how far and where to the picture moves.",
     "Do not use positions of this controller: the report names the fault. Compare the scanner's calibration of the "
-    "offset and of the scan range at the panel, and the angle; report it with the trace of this run.",
+    "offset and of the scan range at the panel, and the angle. A scan too fast for the feedback shows wrong lengths: "
+    "repeat it more slowly first. Then report it with the trace of this run.",
     after=("contact",),
     contact=True,
     operations=(AXES,),

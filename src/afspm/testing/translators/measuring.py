@@ -175,6 +175,7 @@ class CheckMeasurements:
         complaints: logged warnings and errors; the list grows.
 
     Attributes:
+        set_by_hand: takes the present settings, which a person has made, for those to put back at the end.
         is_withdrawn: whether the tip was withdrawn at the end, and stays so.
         frames: the frames to scan; raises Skipped if the microscope has not published its frame.
     """
@@ -194,6 +195,7 @@ class CheckMeasurements:
         self._heeded = len(complaints)
         self._kept: dict[str, Taken | Skipped] = {}
         self.is_withdrawn = False
+        self.set_by_hand: Callable[[], None] = lambda: None
         self._checked = ""
         initial = client.observations.newest(ScanParameters)
         region = None if initial is None else initial.region

@@ -48,7 +48,8 @@ class SettingsBefore:
     def restore(self, client: CheckClient, *, is_away: bool = False) -> list[str]:
         """Stop a running scan or spectrum, and restore all settings.
 
-        The feedback is left as it is with a tip that is away: switched on, it would bring the tip to the sample again.
+        The feedback is switched on at most, never off: without it a tip at the sample is in danger. With a tip that is
+        away it is left as it is: switched on, it would bring the tip to the sample again.
 
         Args:
             is_away: whether the tip was withdrawn; otherwise the controller is asked.
@@ -61,10 +62,12 @@ class SettingsBefore:
             client.quiet()
             client.come_to_rest()
             is_away = is_away or (self.support.has(names.ENGAGED) and client.get(names.ENGAGED).value == "false")
+            was_on = self.parameters.get(names.FEEDBACK_ON)
+            switches_on = not is_away and was_on is not None and was_on.value == "true"
             self._put_back_together(client, wrong, is_away=is_away)
             ordered = sorted(self.parameters, key=lambda name: name in _LAST)
             for name in ordered:
-                if not (is_away and name == names.FEEDBACK_ON):
+                if name != names.FEEDBACK_ON or switches_on:
                     self._put_back(client, name, wrong)
         # listed in the report instead of raised: the results of the checks must not get lost
         except (Lost, Failed) as error:
@@ -75,7 +78,7 @@ class SettingsBefore:
         # settings of one packet are restored in one request: one by one, they would pass through invalid combinations
         observations = client.observations
         feedback, in_force = self.feedback, observations.newest(Feedback)
-        if is_away and feedback is not None:
+        if feedback is not None and (is_away or not feedback.on):
             feedback = replace(feedback, on=None if in_force is None else in_force.on)
         settings = (
             (ControlRequest.SET_SCAN_PARAMS, observations.newest(ScanParameters), self.frame, self._frame()),
@@ -135,6 +138,13 @@ def restored(session: CheckSession, report: CheckReport) -> Iterator[CheckMeasur
         session.client, session.support, session.options.frame_m, excused=session.excused, complaints=session.complaints
     )
     before = SettingsBefore.of(session.client, session.support)
+
+    def take_again() -> None:
+        nonlocal before
+        now = SettingsBefore.of(session.client, session.support)
+        before = replace(now, parameters={name: session.client.get(name) for name in now.parameters})
+
+    kit.set_by_hand = take_again
     try:
         yield kit
     finally:
