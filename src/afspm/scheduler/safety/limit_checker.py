@@ -156,6 +156,7 @@ class LimitChecker:
             try:
                 self._check_range(name, known.value, limit, _TOLD_REACH)
             except _Breach as breach:
+                breach.reason += ", and is in force: set it back at the panel, or by a request"
                 return _action_error(request, breach)
         return None
 
