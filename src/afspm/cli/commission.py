@@ -105,7 +105,12 @@ class Terminal:
             self._console.print(rest, style=_STYLES.get(rest[:1]))
 
     def confirm(self, question: str) -> bool:
-        return self._line(f"{question} [y/N] ").strip().lower() in ("y", "yes")
+        for _ in range(_TRIES):
+            answer = self._line(f"{question} [y/N] ").strip().casefold()
+            if answer in ("y", "yes", "", "n", "no"):
+                return answer in ("y", "yes")
+            self.show(f"  {answer!r} is neither: type y or n")
+        return False
 
     def text(self, question: str) -> str:
         return self._line(f"{question}: ")

@@ -53,3 +53,13 @@ def test_choice_without_a_default_ends_after_a_few_empty_answers(
     with pytest.raises(KeyboardInterrupt):
         Terminal().choose("What is connected?", ["instrument", "maker's program"])
     assert "no choice after 5 answers: ended" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("lines", "confirmed"), [(["y"], True), ([""], False), (["1", "Yes"], True), (["1"] * 5, False), (["no"], False)]
+)
+def test_confirmation_is_asked_again_for_what_is_neither_yes_nor_no(
+    typed: list[str], lines: list[str], confirmed: bool
+) -> None:
+    typed += lines
+    assert Terminal().confirm("Shall afspm do this now?") is confirmed
