@@ -70,16 +70,21 @@ class Onlooker(Component):
     def run(self) -> None:
         gateway, dashboard = self._url("gateway"), self._url("dashboard")
         until_s = time.monotonic() + WITHIN_S
-        while len(known := json.loads(_get(f"{gateway}/v1/scans"))) < self.scans and time.monotonic() < until_s:
+        # a controller's channels come one by one, so the newest scan may lack the one to look at
+        while len(known := self._known(gateway)) < self.scans and time.monotonic() < until_s:
             self.scope.sleep(1.0)
-        seen = [self._look(gateway, dashboard, one) for one in known]
+        seen = [self._look(gateway, dashboard, one, channel) for one, channel in known]
         (Path(self.run_dir) / "seen.json").write_text(json.dumps(seen), encoding="utf-8")
         self.scope.end_experiment()
 
-    def _look(self, gateway: str, dashboard: str, scan: dict[str, Any]) -> dict[str, str]:
+    def _known(self, gateway: str) -> list[tuple[dict[str, Any], str]]:
         roles = self.scope.channels.names
         shown = roles.get("height") or roles["intensity"]
-        channel = next(one["name"] for one in scan["channels"] if one["name"] in shown)
+        scans = json.loads(_get(f"{gateway}/v1/scans"))
+        channels = [next((one["name"] for one in scan["channels"] if one["name"] in shown), "") for scan in scans]
+        return [known for known in zip(scans, channels, strict=True) if known[1]]
+
+    def _look(self, gateway: str, dashboard: str, scan: dict[str, Any], channel: str) -> dict[str, str]:
         asked = urllib.parse.urlencode({"time": scan["id"], "channel": channel})
         found = {
             "values": f"{gateway}/v1/scans/{scan['id']}/values?channel={urllib.parse.quote(channel)}",
