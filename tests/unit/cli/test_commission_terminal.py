@@ -58,7 +58,7 @@ def test_choice_without_a_default_ends_after_a_few_empty_answers(
 @pytest.mark.parametrize(
     ("lines", "confirmed"), [(["y"], True), ([""], False), (["1", "Yes"], True), (["1"] * 5, False), (["no"], False)]
 )
-def test_confirmation_is_asked_again_for_what_is_neither_yes_nor_no(
+def test_answer_that_is_neither_yes_nor_no_is_asked_for_again(
     typed: list[str], lines: list[str], confirmed: bool
 ) -> None:
     typed += lines
