@@ -147,7 +147,7 @@ def _private(run: Run, traces: Iterable[Path]) -> Iterator[PrivateText]:
     yield from of_this_computer(str(run.facts.get(COMPUTER, "")))
     yield PrivateText("the experiment's name", run.name)
     for row in (*run.scans, *run.spectra):
-        yield from of_path("a file of the controller", row.filename)
+        yield from _of_path("a file of the controller", row.filename)
         if row.file:
             try:
                 yield from _of_header(run.about(row))
@@ -167,7 +167,7 @@ def of_trace(traces: Iterable[Path]) -> Iterator[PrivateText]:
     """Yield names, folders and written entries of the controller's files, and folders in its answers."""
     for line in traced(traces):
         if isinstance(line, TracedFile):
-            yield from of_path("a file of the controller", line.file)
+            yield from _of_path("a file of the controller", line.file)
             yield from _of_header(_header(line))
         elif isinstance(line, TracedExchange):
             for folder in _folders(line.answered):
@@ -203,8 +203,7 @@ def _texts(content: bytes) -> Iterator[bytes]:
             yield text
 
 
-def of_path(where: str, name: str) -> Iterator[PrivateText]:
-    """Yield the folder of a file, and its name without a number."""
+def _of_path(where: str, name: str) -> Iterator[PrivateText]:
     path = PureWindowsPath(name) if "\\" in name else PurePosixPath(name)
     if str(path.parent) not in (".", path.anchor):
         yield PrivateText(where, str(path.parent))

@@ -84,7 +84,7 @@ class Guide:
     scans: dict[str, list[Scan]] = field(default_factory=dict)
     unprepared: set[str] = field(default_factory=set)
     _is_unseen: bool = False
-    _goes_further: bool | None = None
+    _further: bool | None = None
 
     @property
     def clock(self) -> Clock:
@@ -107,7 +107,7 @@ class Guide:
         self.prompts.show(f"\n{step.title}\n{step.explained}")
         if step.needs_panel and not self.has_panel:
             raise Skipped(f"{NO_PANEL} or cable")
-        if step.for_claims and not self._goes_on():
+        if step.for_claims and not self._wants_further():
             raise Skipped("left out")
         self._is_unseen = False
         self._prepare(step)
@@ -119,10 +119,10 @@ class Guide:
             self.seen[step.name] = True
         return line
 
-    def _goes_on(self) -> bool:
-        if self._goes_further is None:
-            self._goes_further = self.prompts.confirm(_FURTHER)
-        return self._goes_further
+    def _wants_further(self) -> bool:
+        if self._further is None:
+            self._further = self.prompts.confirm(_FURTHER)
+        return self._further
 
     def _prepare(self, step: CommissioningStep) -> None:
         for name, claim in self.claims.items():
