@@ -127,3 +127,9 @@ def test_value_is_asked_for_a_limited_number_of_times(typed: str, says: str) -> 
     with pytest.raises(Skipped, match=r"width: none of 5 answers could be compared with 5 nm"):
         guide(person, has_panel=True).compare("width", 5.0, "nm")
     assert sum(says in line for line in (*person.shown, *person.asked)) == 5
+
+
+def test_noise_of_a_translator_without_known_settings_is_skipped() -> None:
+    (noise,) = [step for step in all_steps() if step.name == "noise"]
+    with pytest.raises(Skipped, match="no setting of this translator is known"):
+        guide(Person(), has_panel=True).perform(noise)

@@ -13,11 +13,18 @@ from typing import Final
 import numpy as np
 from scipy.signal import correlate
 
+from afspm.model import Scan
 from afspm.model.arrays import Array
 from afspm.model.line_levelling import Levelling, levelled
+from afspm.testing.conformance import Skipped, expect
+from afspm.testing.translators.measuring import TURN_RAD
 
 LIKE: Final = 0.6
 """Least correlation of two pictures that show the same structure."""
+OFFSETS: Final = ((-0.1, -0.1), (0.1, -0.1), (-0.1, 0.1))
+"""Centres of the frames that are compared, as fractions of the whole frame: one, moved along x, moved along y."""
+PART: Final = (0.5, 0.5)
+PIXELS: Final = (64, 64)
 _OVERLAP: Final = 0.45
 """Least overlap of two pictures: a move of .4 along any direction leaves half of one."""
 _RIVAL: Final = 0.05
@@ -68,6 +75,39 @@ def _peak(values: Array, at: int) -> float:
     low, top, high = values[at - 1 : at + 2]
     curve = low - 2.0 * top + high
     return at + float(0.5 * (low - high) / curve) if curve < 0.0 else float(at)
+
+
+def moves(taken: list[list[Scan]]) -> list[list[Array]]:
+    """Return the moves of the upright pictures and of the turned ones, in units of the frame's, by the best channel.
+
+    Args:
+        taken: all channels of each scan: of `OFFSETS`, of the first one again, and of two turned frames, if tried.
+
+    Raises:
+        Skipped: no channel shows the moves.
+        Failed: the scans have no channel in common.
+    """
+    groups = [taken[:4], taken[4:]] if taken[4:] else [taken]
+    seen = [
+        [[displacement(group[0][i].values, one[i].values) for one in group[1:]] for group in groups]
+        for i in range(min(map(len, taken)))
+        if len({one[i].channel for one in taken}) == 1 and all(one[i].shape == PIXELS for one in taken)
+    ]
+    expect(seen, "the same channels in all scans", "no channel that all have")
+    best = max(seen, key=lambda channel: min(one.likeness for group in channel for one in group))
+    for one in (one for group in best for one in group):
+        if one.likeness < LIKE:
+            raise Skipped(f"no structure is seen in all scans (correlation {one.likeness:.2f}): noise shows no move")
+        if one.is_ambiguous:
+            raise Skipped("the structure repeats, so that several moves fit: choose a place without a lattice")
+    unit_px = 0.2 / 0.5 * (np.array(PIXELS[::-1]) - 1.0)
+    drift = best[0][2].move / unit_px
+    upright = [one.move / unit_px - drift * part for one, part in zip(best[0], (1 / 3, 2 / 3, 0), strict=True)]
+    cos, sin = math.cos(TURN_RAD), math.sin(TURN_RAD)
+    turned = [
+        [one.move / unit_px - np.array([[cos, sin], [-sin, cos]]) @ drift / 3 for one in group] for group in best[1:]
+    ]
+    return [upright, *turned]
 
 
 def faults(along_x: Array, along_y: Array, turned: Array | None, turned_deg: float = 0.0) -> list[str]:

@@ -18,7 +18,6 @@ from afspm.basics.formatting import quantity
 from afspm.basics.units import same_kind
 from afspm.drawing import raster
 from afspm.model import ChannelRoles, ControlRequest, Feedback, RegionChange, Scan, ScanParameters, ScopeState, names
-from afspm.model.arrays import Array
 from afspm.model.requests import Parameter
 from afspm.testing.commissioning import lines_in_scan, moved_frame
 from afspm.testing.commissioning.guide import UNSEEN, Guide
@@ -183,7 +182,7 @@ def _compare_values(guide: Guide) -> int:
 )
 def _safe_tip(guide: Guide) -> str:
     client = guide.kit.client
-    is_on = str(client.get(names.SAFE_TIP_ON).value).lower() in names.ON_WORDS
+    is_on = _is_on(guide, names.SAFE_TIP_ON)
     threshold = client.get(names.SAFE_TIP_THRESHOLD)
     at = quantity(number(threshold, threshold.unit or ""), threshold.unit or "")
     line = f"on, at {at}" if is_on else f"OFF (its threshold: {at})"
@@ -203,21 +202,29 @@ def _safe_tip(guide: Guide) -> str:
     moves=False,
 )
 def _noise(guide: Guide) -> str:
-    client = guide.kit.client
     wanted = {
         name: row
         for name, row in guide.rows.items()
         if guide.kit.support.has(name) and row.is_number and not row.measured
     }
-    seen: dict[str, list[float]] = {name: [] for name in wanted}
-    until_s = client.clock.monotonic_s() + client.clock.real_s(_NOISE_S)
-    while not seen or client.clock.monotonic_s() < until_s or len(next(iter(seen.values()))) < _LEAST_READINGS:
-        for name, row in wanted.items():
-            seen[name].append(number(client.get(name), row.wire_unit))
+    if not wanted:
+        raise Skipped("no setting of this translator is known")
+    seen = _readings(guide, {name: row.wire_unit for name, row in wanted.items()}, _NOISE_S)
     noisy = {name: guide.propose_resolution(wanted[name], values) for name, values in seen.items()}
     found = ", ".join(f"{name} by {spread}" for name, spread in noisy.items() if spread)
-    count = min(map(len, seen.values()), default=0)
+    count = min(map(len, seen.values()))
     return f"{len(wanted)} settings, {count} readings each: {f'not steady: {found}' if found else 'all steady'}"
+
+
+def _readings(guide: Guide, units: Mapping[str, str], lasts_s: float = 0.0) -> dict[str, list[float]]:
+    # for an experiment time, and a least number of each
+    clock, found = guide.kit.clock, {name: list[float]() for name in units}
+    until_s, rounds = clock.monotonic_s() + clock.real_s(lasts_s), 0
+    while rounds < _LEAST_READINGS or clock.monotonic_s() < until_s:
+        rounds += 1
+        for name, unit in units.items():
+            found[name].append(number(guide.kit.client.get(name), unit))
+    return found
 
 
 # --- with the tip withdrawn ---
@@ -492,7 +499,7 @@ def _act_in_scan(guide: Guide, act: str, done: str) -> int:
 
 def _engaged(guide: Guide) -> bool | None:
     # whether the tip reads as at the sample; None if the controller does not show it
-    return guide.kit.client.get(names.ENGAGED).value == "true" if guide.kit.support.has(names.ENGAGED) else None
+    return _is_on(guide, names.ENGAGED) if guide.kit.support.has(names.ENGAGED) else None
 
 
 def _go_on(guide: Guide) -> None:
@@ -589,18 +596,18 @@ def _comes(guide: Guide, done: Callable[[], bool], within_s: float) -> bool:
     needs=(names.FEEDBACK_ON,),
 )
 def _feedback_at_panel(guide: Guide) -> str:
-    was_on = _feedback_is_on(guide)
+    was_on = _is_on(guide, names.FEEDBACK_ON)
     for word, wanted in (("off" if was_on else "on", not was_on), ("on" if was_on else "off", was_on)):
         if guide.prompts.text(f"Switch the feedback {word} at the panel, then press Enter (u: leave it)").strip():
             raise Skipped("not switched at the panel")
-        guide.seen["feedback-at-panel"] = follows = _feedback_is_on(guide) is wanted
+        guide.seen["feedback-at-panel"] = follows = _is_on(guide, names.FEEDBACK_ON) is wanted
         expect(follows, f"{names.FEEDBACK_ON} to read {word}", "the other")
     _go_on(guide)
     return "read as the panel switches it"
 
 
-def _feedback_is_on(guide: Guide) -> bool:
-    return str(guide.kit.client.get(names.FEEDBACK_ON).value).lower() in names.ON_WORDS
+def _is_on(guide: Guide, name: str) -> bool:
+    return str(guide.kit.client.get(name).value).lower() in names.ON_WORDS
 
 
 @_step(
@@ -695,11 +702,6 @@ def _contact(guide: Guide) -> str:
     return _agreed(guide, at_sample=True)
 
 
-_OFFSETS: Final = ((-0.1, -0.1), (0.1, -0.1), (-0.1, 0.1))
-"""Centres of the frames that are compared, as fractions of the whole frame: one, moved along x, moved along y."""
-_PART, _PIXELS, _TURN_DEG = (0.5, 0.5), (64, 64), math.degrees(TURN_RAD)
-
-
 @_step(
     "Moving the frame",
     "afspm takes six scans: one, one moved along x, one moved along y, the first again, and two of a turned frame, and "
@@ -714,43 +716,21 @@ _PART, _PIXELS, _TURN_DEG = (0.5, 0.5), (64, 64), math.degrees(TURN_RAD)
 )
 def _moved_frame(guide: Guide) -> str:
     kit = guide.kit
-    upright = [kit.frames.part(offset, _PART, _PIXELS) for offset in (*_OFFSETS, _OFFSETS[0])]
+    upright = [
+        kit.frames.part(offset, moved_frame.PART, moved_frame.PIXELS)
+        for offset in (*moved_frame.OFFSETS, moved_frame.OFFSETS[0])
+    ]
     x, y = 0.1 * math.cos(TURN_RAD), 0.1 * math.sin(TURN_RAD)
-    turned = [kit.frames.part(sign, _PART, _PIXELS, TURN_RAD) for sign in ((-x, -y), (x, y))]
+    turned = [kit.frames.part(sign, moved_frame.PART, moved_frame.PIXELS, TURN_RAD) for sign in ((-x, -y), (x, y))]
     taken = [kit.take_scan(one).scans for one in (*upright, *(turned if kit.support.has(names.SCAN_ANGLE) else ()))]
-    (x_move, y_move, drift), *of_turned = _moves(taken)
-    found = moved_frame.faults(x_move, y_move, of_turned[0][0] if of_turned else None, _TURN_DEG)
+    (x_move, y_move, drift), *of_turned = moved_frame.moves(taken)
+    found = moved_frame.faults(x_move, y_move, of_turned[0][0] if of_turned else None, math.degrees(TURN_RAD))
     if found:
         failure = Failed("a picture that moves as its frame does", "; ".join(found))
         kit.excuse("scan/picture", failure)
         raise failure
     lengths = " and ".join(f"{np.hypot(*one):.3f}" for one in (x_move, y_move))
     return f"moves of 1 show as {lengths} along x and y; drift of {np.hypot(*drift):.3f} moves in three scans"
-
-
-def _moves(taken: list[list[Scan]]) -> list[list[Array]]:
-    # the moves of the upright pictures and of the turned ones, in units of the frame's, of the channel that shows best
-    groups = [taken[:4], taken[4:]] if taken[4:] else [taken]
-    seen = [
-        [[moved_frame.displacement(group[0][i].values, one[i].values) for one in group[1:]] for group in groups]
-        for i in range(min(map(len, taken)))
-        if len({one[i].channel for one in taken}) == 1 and all(one[i].shape == _PIXELS for one in taken)
-    ]
-    expect(seen, "the same channels in all scans", "no channel that all have")
-    best = max(seen, key=lambda channel: min(one.likeness for group in channel for one in group))
-    for one in (one for group in best for one in group):
-        if one.likeness < moved_frame.LIKE:
-            raise Skipped(f"no structure is seen in all scans (correlation {one.likeness:.2f}): noise shows no move")
-        if one.is_ambiguous:
-            raise Skipped("the structure repeats, so that several moves fit: choose a place without a lattice")
-    unit_px = 0.2 / 0.5 * (np.array(_PIXELS[::-1]) - 1.0)
-    drift = best[0][2].move / unit_px
-    upright = [one.move / unit_px - drift * part for one, part in zip(best[0], (1 / 3, 2 / 3, 0), strict=True)]
-    cos, sin = math.cos(TURN_RAD), math.sin(TURN_RAD)
-    turned = [
-        [one.move / unit_px - np.array([[cos, sin], [-sin, cos]]) @ drift / 3 for one in group] for group in best[1:]
-    ]
-    return [upright, *turned]
 
 
 @_step(
@@ -795,26 +775,19 @@ def _axes(guide: Guide) -> str:
 )
 def _held_z(guide: Guide) -> str:
     kit, client = guide.kit, guide.kit.client
-    before = _heights(guide, 3.0 * _HELD_S)
+    unit = {names.TIP_Z: "m"}
+    before = _readings(guide, unit, 3.0 * _HELD_S)[names.TIP_Z]
     row = guide.rows.get(names.TIP_Z)
     # the translator compares means of as many readings
     means = [float(one.mean()) for one in np.array_split(before, len(before) // _LEAST_READINGS)]
     if row is not None and (spread := guide.propose_resolution(row, means)):
         raise Skipped(f"z differs by {spread} between means of {_LEAST_READINGS} readings, with the feedback on")
     kit.act(names.HOLD_Z)
-    held = _heights(guide, _HELD_S)
+    held = _readings(guide, unit, _HELD_S)[names.TIP_Z]
     mark = client.observations.mark()
     kit.act(names.RELEASE_Z)
     client.settled(mark, awaiting=ScopeState.FREE)
-    expect(_feedback_is_on(guide), "the feedback on again", "it is off")
-    after = _heights(guide)
+    expect(_is_on(guide, names.FEEDBACK_ON), "the feedback on again", "it is off")
+    after = _readings(guide, unit)[names.TIP_Z]
     by = [quantity(float(np.mean(one) - np.mean(before)), "m") for one in (held, after)]
     return f"z moved by {by[0]} while it was off, and by {by[1]} once it was on again"
-
-
-def _heights(guide: Guide, lasts_s: float = 0.0) -> list[float]:
-    clock, found = guide.kit.clock, list[float]()
-    until_s = clock.monotonic_s() + clock.real_s(lasts_s)
-    while len(found) < _LEAST_READINGS or clock.monotonic_s() < until_s:
-        found.append(number(guide.kit.client.get(names.TIP_Z), "m"))
-    return found
