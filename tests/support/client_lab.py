@@ -19,7 +19,9 @@ from afspm.client.component import Component
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
 from afspm.model import (
+    LEND_REQUEST,
     RELAY_REQUEST,
+    RETURN_REQUEST,
     ControlRequest,
     ControlResponse,
     ControlState,
@@ -36,6 +38,7 @@ from afspm.model import (
     ScanParameters,
     ScopeState,
     ScopeStatus,
+    Settings,
     Spectrum,
 )
 from afspm.model.state import FeedbackUnits
@@ -89,6 +92,7 @@ class Lab:
     """A laboratory whose events are in the order of time; `poll` moves the clock to the next event.
 
     Attributes:
+        bases: the values before those that were lent.
         most_at_once: number of events that a poll returns, with answers before packets, as from real sockets; None:
             all, in their order.
     """
@@ -101,6 +105,7 @@ class Lab:
         self.parameters = ScanParameters(OTHER_REGION, (8, 8))
         self.position = ProbePosition((0.0, 0.0))
         self.values: dict[str, str] = {"tip-bias-voltage": "0.5"}
+        self.bases: dict[str, str] = {}
         self.channels: tuple[str, ...] = ("Height", "Phase")
         self.executed: list[str] = []
         self.requests: list[Request] = []
@@ -305,6 +310,10 @@ class Lab:
             return self.does(asks[request.kind], self.name, request.subject or 0)
         if request.kind == RELAY_REQUEST:
             return Response(ControlResponse.SUCCESS)
+        if request.kind == RETURN_REQUEST:
+            for name in [one.name for one in request.subject.parameters] or [*self.bases]:
+                self.values[name] = self.bases.pop(name, self.values[name])
+            return Response(ControlResponse.SUCCESS)
         reads = request.kind == ControlRequest.PARAM and request.subject.value is None
         if self.control.holder != self.name and not reads and request.kind != ControlRequest.ACTION_SUPPORT:
             return Response(ControlResponse.NOT_IN_CONTROL, reason="you are not in control")
@@ -333,6 +342,11 @@ class Lab:
                 self._start(ScopeState.SPEC, self.finish_spectrum)
             case ((ControlRequest.ACTION | ControlRequest.ACTION_SUPPORT), "x-crash"):
                 return Response(ControlResponse.ACTION_NOT_SUPPORTED, reason="no such action")
+            case kind, Settings() as wanted if kind == LEND_REQUEST:
+                for one in wanted.parameters:
+                    self.bases.setdefault(one.name, self.values[one.name])
+                    self.values[one.name] = one.value or ""
+                return Response(0, wire.encode(wanted)[1])
             case ControlRequest.PARAM, Parameter(name, value, unit):
                 if value is not None:
                     self.values[name] = value

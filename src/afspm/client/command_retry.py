@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC
 
 from afspm import wire
@@ -14,7 +14,9 @@ from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.parameter_text import Value, value_in
 from afspm.model import (
+    LEND_REQUEST,
     RELAY_REQUEST,
+    RETURN_REQUEST,
     ControlRequest,
     ControlResponse,
     Parameter,
@@ -23,12 +25,13 @@ from afspm.model import (
     Response,
     ResponseDetail,
     ScopeState,
+    Settings,
     request_name,
 )
 from afspm.model.events import MeasurementSettings
 from afspm.model.microscope_status import feedback_of
 from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S
-from afspm.wire.messages import FEEDBACK
+from afspm.wire.messages import FEEDBACK, LENT_SETTINGS
 
 PATIENCE_S = 60.0  # real time for the restart of a translator
 RETRY_S = 1.0  # before a repetition, unless a state is published earlier
@@ -54,6 +57,7 @@ _ASKED_FOR: dict[int, str] = {
     ControlRequest.SET_CONTROL_MODE: "the mode",
     ControlRequest.END_EXPERIMENT: "ending the experiment",
     RELAY_REQUEST: "the note",
+    LEND_REQUEST: "a setting of the measurement",
 }
 _NO_STATE = (
     "waiting for the microscope, which has published no state yet: is its translator running? If it does not "
@@ -64,15 +68,25 @@ NOT_IN_CONTROL = {ControlResponse.NOT_IN_CONTROL, ControlResponse.WRONG_CONTROL_
 
 
 class CommandRetry:
-    """A sender of commands to the microscope, through the scheduler, for a component in control."""
+    """A sender of commands to the microscope, through the scheduler, for a component in control.
+
+    Attributes:
+        may_have_lent: whether the scheduler may have something to set back.
+        states: whether something was stated since the last measurement began.
+        decided: parameters that can't be lent: they stay as they were set.
+    """
 
     def __init__(self, link: ExperimentLink, control: ControlHold) -> None:
         self._link = link
         self._control = control
         self._logged_reason = ""
         self._logged_limits: set[str] = set()
+        self._lends = True
+        self.may_have_lent = True
+        self.states = False
+        self.decided: set[str] = set()
 
-    def ask(self, kind: ControlRequest, subject: object = None, *, until_s: float | None = None) -> Response:
+    def ask(self, kind: int, subject: object = None, *, until_s: float | None = None) -> Response:
         """Send a command until it succeeds, inside a block with control; after a loss of control, wait to regain it.
 
         In an unbroken block a loss of control is an error: other components may have changed the microscope meanwhile.
@@ -148,6 +162,48 @@ class CommandRetry:
         response = self.ask(ControlRequest.PARAM, wanted, until_s=until_s)
         return wire.decode_parameter(response.payload) if response.payload else wanted
 
+    def lend(
+        self, wanted: Sequence[Parameter], until_s: float | None, settle_s: float | None = None
+    ) -> dict[str, Parameter]:
+        """Set what the next measurement states, and return the values in force by name. Control must be held.
+
+        The scheduler sets the former values back for measurements that do not state them. Raises as `ask`.
+        """
+        if self._lends:
+            try:
+                response = self.ask(LEND_REQUEST, Settings.of(*wanted, settle_s=settle_s), until_s=until_s)
+            except Refused as refusal:
+                if refusal.response != ControlResponse.CMD_NOT_SUPPORTED:
+                    raise
+                self._lends = False
+                self._link.log.warning("this scheduler lends no settings: they are set, and stay in force")
+            else:
+                found: Settings = wire.decode(LENT_SETTINGS.name, response.payload)
+                self.may_have_lent, self.states = True, bool(wanted)
+                self.decided |= {one.parameter.name for one in found.settings if one.is_lent is False}
+                return {one.name: one for one in found.parameters}
+        return {one.name: self.set_parameter(one, until_s) for one in wanted}
+
+    def give_back(self, names: Sequence[str], until_s: float | None) -> None:
+        """Let the scheduler set back what was lent, now or as soon as it can; without names, all of it.
+
+        Also what an earlier life of this component has lent.
+
+        Raises:
+            NoResponse: the scheduler does not answer by `until_s`.
+        """
+        if not (names or self.may_have_lent):
+            return
+        link = self._link
+        while True:
+            response = link.request(RETURN_REQUEST, Settings.of(*map(Parameter, names)), until_s=until_s)
+            if response.again_ns is None or not self._control.wait_for_limit(response.again_ns, until_s):
+                break
+            self._log_limit(response.again_ns, response.reason)
+        if not response.ok:
+            link.log.warning("settings of measurements are not set back: %s", response.reason)
+        self.may_have_lent = bool(names)
+
     def publish_settings(self, settings: tuple[Parameter, ...], key: str, point: int | None = None) -> None:
         """Ask the scheduler to publish the parameters that a sweep has set for the measurement `key`."""
         link = self._link
@@ -158,7 +214,7 @@ class CommandRetry:
 
     def send(
         self,
-        kind: ControlRequest,
+        kind: int,
         subject: object = None,
         *,
         request_id: str = "",
@@ -217,18 +273,18 @@ class CommandRetry:
             end_s = end_s if until_s is None else min(end_s, until_s)
             if now_s >= end_s:
                 raise NoResponse(
-                    f"the microscope does not answer {kind.name}: {response.reason or 'no reason given'}",
+                    f"the microscope does not answer {request_name(kind)}: {response.reason or 'no reason given'}",
                     where=link.name,
                     hint="is its translator running? the request may or may not have been carried out",
                 )
             if not has_warned and (response.detail is not ResponseDetail.NOT_SENT or now_s >= late_s):
                 why = response.reason or "no reason given"
-                link.log.warning("the microscope does not answer %s (%s); asking again", kind.name, why)
+                link.log.warning("the microscope does not answer %s (%s); asking again", request_name(kind), why)
                 has_warned = True
             is_repeated = True
             self._wait_for_news(link.earlier(RETRY_S, end_s))
 
-    def get_over(self, kind: ControlRequest, response: Response, states: int, until_s: float | None) -> None:
+    def get_over(self, kind: int, response: Response, states: int, until_s: float | None) -> None:
         """Handle a failed response: record a loss of control, or wait for a free microscope or a limit on time.
 
         Args:
@@ -240,7 +296,9 @@ class CommandRetry:
         """
         if response.code == ControlResponse.NO_RESPONSE:
             return  # control was lost: the caller regains it before the next attempt
-        if response.code in NOT_IN_CONTROL:
+        if response.detail is ResponseDetail.STATE_AGAIN:
+            self._link.log.info("the settings are stated again: %s", response.reason)
+        elif response.code in NOT_IN_CONTROL:
             self._control.lost(response.reason)
         elif response.code == ControlResponse.NOT_FREE:
             self._log_reason(response.reason)

@@ -280,6 +280,7 @@ class MeasurementRunner:
                 is_lost=lambda: link.view.state is ScopeState.FREE,
             )
         if response.ok or cycle.begun:
+            self._commands.states = False
             self._follow(task, watch)
             return
         if response.code == ControlResponse.NO_RESPONSE and self._control.held:

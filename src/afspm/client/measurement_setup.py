@@ -30,6 +30,9 @@ class MeasurementSetup:
 
     Args:
         view: the published settings in force.
+
+    Attributes:
+        holds_z: whether z is held by this component, whose settings stay as they were when it began.
     """
 
     def __init__(
@@ -45,6 +48,7 @@ class MeasurementSetup:
         self._commands = commands
         self._targets = targets
         self._withdrawal = withdrawal
+        self.holds_z = False
         self._rounded: tuple[ScanParameters, ScanParameters | None] | None = None
 
     def reach(self, target: Target, until_s: float | None) -> tuple[Parameter, ...]:
@@ -83,10 +87,29 @@ class MeasurementSetup:
                 self._commands.ask(ControlRequest.PARAM, Parameter(names.SPEC_KIND, target.kind), until_s=until_s)
             if target.at_m is not None:
                 self.move_probe(target.at_m, until_s)
+        in_force = self.lend(target.lent, target.settings, until_s, target.settle_s)
         if target.settings:
-            of_microscope = (one for one in target.settings if not is_of_instrument(one.name))
-            in_force = tuple(self._commands.set_parameter(one, until_s) for one in of_microscope)
-            self._commands.publish_settings((*reached, *in_force), key, target.point)
+            shown = (in_force[one.name] for one in target.settings if one.name in in_force)
+            self._commands.publish_settings((*reached, *shown), key, target.point)
+
+    def lend(
+        self,
+        of_block: tuple[Parameter, ...],
+        own: tuple[Parameter, ...],
+        until_s: float | None,
+        settle_s: float | None = None,
+    ) -> dict[str, Parameter]:
+        """State settings for the next measurement, and return those in force by name.
+
+        Args:
+            of_block: of the enclosing blocks, which `own` ones come before.
+        """
+        decided = self._commands.decided
+        of_block = () if self.holds_z else tuple(one for one in of_block if one.name not in decided)
+        wanted = {one.name: one for one in (*of_block, *own) if not is_of_instrument(one.name)}
+        # what was stated for a measurement that did not begin must not hold for this one
+        is_needed = bool(wanted) or (self._commands.states and not self.holds_z)
+        return self._commands.lend(tuple(wanted.values()), until_s, settle_s) if is_needed else {}
 
     def move_probe(self, xy_m: XY, until_s: float | None, *, drifts: bool = False) -> None:
         """Move the probe to (x, y) in m, unless it is there already.

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import TypedDict, Unpack, get_args
+from typing import TypedDict, TypeVar, Unpack, get_args
 
 from afspm import wire
 from afspm.basics import RequestError
@@ -20,14 +19,14 @@ from afspm.client.control_hold import ControlHold
 from afspm.client.events import Events, PublishedEvent
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.experiment_view import ExperimentView, checked_call
-from afspm.client.former_values import FormerValues, Steps
+from afspm.client.former_targets import FormerTargets, partition
 from afspm.client.held_height import HeldHeight
 from afspm.client.instrument_targets import InstrumentTargets
 from afspm.client.keyed_results import KeyedResults, check_key
 from afspm.client.measurement import MeasurementRunner
 from afspm.client.measurement_setup import MeasurementSetup
 from afspm.client.parameter_text import Value, to_parameter, value_in
-from afspm.client.sweeping import Measure, ParameterSweep, SweepPoint, values_between
+from afspm.client.sweeping import Measure, ParameterSweep, SweepPoint
 from afspm.client.sweeping_at import PlacedSweep, PlacedSweeper
 from afspm.client.targets import ScanTarget, SpectrumTarget, Target, xy_of
 from afspm.client.withdrawal import APPROACH_S, Withdrawal
@@ -64,6 +63,7 @@ from afspm.transport.process.parent import StopRequested
 __all__ = ["Events", "PublishedEvent", "Scope"]
 
 Place = tuple[float | str, float | str]
+TargetT = TypeVar("TargetT", ScanTarget, SpectrumTarget)
 SET_BACK_WITHIN_S = 60.0
 """Limit on the wait for control after a failed sweep, real time."""
 ANSWER_S = 60.0  # default of readings; calls that wait for control or a measurement have no limit by default
@@ -114,6 +114,8 @@ class Scope(ExperimentView):
         self._frame = frame
         self._curve: tuple[Parameter, ...] = ()
         self._kind_of_curves: str | None = None
+        self._lent: dict[str, Parameter] = {}
+        self._settle_s: float | None = None
         self._sweeps = False
         self._begun: tuple[int, float] | None = None  # finished parts and time at the first `progress`
         self._control = ControlHold(link, self.problems)
@@ -132,6 +134,7 @@ class Scope(ExperimentView):
         region: Region | None = None,
         *,
         shape: tuple[int, int] | None = None,
+        settings: Mapping[str, Value] | None = None,
         key: str | None = None,
         repeat: bool = True,
         timeout_s: float | None = None,
@@ -144,13 +147,15 @@ class Scope(ExperimentView):
         Args:
             region: region to scan; None: the present region.
             shape: (rows, columns); None: the present shape.
+            settings: parameters for this scan alone, {"tip-bias-voltage": "0.5 V"}, beside those of the blocks around
+                it: see `settings`.
             key: name of the scan, which is then taken only once in this run: after a restart of the component the call
                 returns the saved scan. Each measurement of a component needs its own key. A saved scan takes space on
                 disk until `forget`.
             repeat: whether to take the scan again if control is lost during the scan; False: raise ControlLost.
         """
         with self._call():
-            target = ScanTarget.of(region, shape, self._frame)
+            target = self._carrying(ScanTarget.of(region, shape, self._frame), settings)
             return self._runner.take(target, key, self._link.until(timeout_s), repeat=repeat).scans
 
     @checked_call
@@ -159,11 +164,12 @@ class Scope(ExperimentView):
         at: Place | None = None,
         *,
         kind: str | None = None,
+        settings: Mapping[str, Value] | None = None,
         key: str | None = None,
         timeout_s: float | None = None,
         **curve: Unpack[CurveArguments],
     ) -> Spectrum:
-        """Take a spectrum; interruptions and `key` as for `scan`.
+        """Take a spectrum; interruptions, `settings` and `key` as for `scan`.
 
             scope.spectrum(("0 nm", "5 nm"), kind="IV", sweep=("-500 mV", "500 mV"), points=201)
 
@@ -174,11 +180,58 @@ class Scope(ExperimentView):
                 `lock_in`, as in `curve_parameters`. For many curves, use `curves`.
         """
         if curve:
-            with self.curves(curve, kind=kind, key=key, timeout_s=timeout_s):
-                return self.spectrum(at, kind=kind, key=key, timeout_s=timeout_s)
+            with self.curves(curve, kind=kind, timeout_s=timeout_s):
+                return self.spectrum(at, kind=kind, settings=settings, key=key, timeout_s=timeout_s)
         with self._call():
-            target = self._spectrum_target(at, kind)
+            target = self._carrying(self._spectrum_target(at, kind), settings)
             return self._runner.take(target, key, self._link.until(timeout_s)).spectrum
+
+    @contextmanager
+    def settings(self, settings: Mapping[str, Value], *, settle: float | str | None = None) -> Iterator[None]:
+        """Take all measurements of the block with these settings.
+
+            with scope.settings({"tip-bias-voltage": "0.5 V", "scan-speed": "2 um/s"}):
+                scope.scan(region)
+
+        Each measurement carries its settings: they are set right before it, and set back before a measurement of
+        others that does not state them, at the end of the block, and if this component ends. In a block within a
+        block, both hold; the inner one comes first. A value that a person or `set` changes outside of measurements is
+        the one to which they are set back. Parameters that change what other numbers mean, or move the tip, can't be
+        set for a while: they are set once, and stay.
+
+        Args:
+            settings: values by parameter, as for `set`.
+            settle: experiment time after a change of bias, setpoint or gains, in s or as text; None: as in [control].
+
+        Raises:
+            InvalidValue: a value is not valid, or a parameter is one of another instrument.
+        """
+        given, outside = _parameters(settings), (self._lent, self._settle_s)
+        self._lent = {**self._lent, **given}
+        self._settle_s = self._settle_s if settle is None else si_or_text(settle, "s")
+        try:
+            with self._giving_back(given.keys() - outside[0].keys()):
+                yield
+        finally:
+            self._lent, self._settle_s = outside
+
+    def _carrying(self, target: TargetT, settings: Mapping[str, Value] | None = None) -> TargetT:
+        own = (*target.settings, *_parameters(settings or {}).values())
+        return replace(target, settings=own, lent=tuple(self._lent.values()), settle_s=self._settle_s)
+
+    @contextmanager
+    def _giving_back(self, names: Collection[str]) -> Iterator[None]:
+        try:
+            yield
+        except (ExperimentEnded, StopRequested):
+            raise  # the scheduler has noticed, or a stop of the run leaves them to a person
+        except BaseException:  # also Ctrl-C, and what the block of the user raises
+            with suppress(RequestError, ExperimentEnded), self._link.interrupts.deferred():
+                self._commands.give_back(sorted(names), self._link.until(SET_BACK_WITHIN_S))
+            raise
+        if names:
+            with self._call():
+                self._commands.give_back(sorted(names), self._link.until(SET_BACK_WITHIN_S))
 
     @contextmanager
     def curves(
@@ -186,23 +239,17 @@ class Scope(ExperimentView):
         settings: CurveSettings,
         *,
         kind: str | None = None,
-        key: str | None = None,
         timeout_s: float | None = None,
     ) -> Iterator[None]:
-        """Take all spectra of the block with these settings, and set the former values back at its end.
+        """Take all spectra of the block with these settings, which are set back as those of `settings`.
 
             with scope.curves({"sweep": ("-500 mV", "500 mV"), "points": 201}, kind="IV"):
                 for number, place in enumerate(places):
                     scope.spectrum(place, kind="IV", key=f"curve-{number}")
 
-        As for `sweep`, control is kept over the block, and the settings are set before each spectrum, so that limits
-        judge them each time; nothing is set back after the end of the experiment or a stop of the process. With a key,
-        a restarted component does so at the end of the same block.
-
         Args:
             settings: as in `curve_parameters`; without any, the block does nothing.
             kind: kind of the spectra, since each has settings of its own; None: the present kind.
-            key: name of the block.
 
         Raises:
             InvalidValue: a setting is not valid or does not fit the kind; a block in a sweep, or of another kind in a
@@ -213,22 +260,17 @@ class Scope(ExperimentView):
             return
         if self._sweeps:
             raise InvalidValue("settings of curves begin before a sweep, not in it", where="curves")
-        of_curves, outside = curve_parameters(settings, kind), (self._curve, self._kind_of_curves)
-        until_s = self._link.until(timeout_s)
-        with self._control.hold(until_s=until_s, keeps=True):
-            with self._call():
-                kind = self._fitting(kind or self._present_kind(until_s))
-                of_curves = curve_parameters(settings, kind)
-                first = None if kind is None else Parameter(names.SPEC_KIND, kind)
-                of_key = None if key is None else f"curves {check_key(key)}"
-                former = self._former([one.name for one in of_curves], of_key, first=first)
-                former.remember(until_s)
-            self._curve, self._kind_of_curves = (*outside[0], *of_curves), kind
-            try:
-                with self._setting_back(former, timeout_s):
-                    yield
-            finally:
-                self._curve, self._kind_of_curves = outside
+        outside = self._curve, self._kind_of_curves
+        with self._call():
+            curve_parameters(settings, kind)
+            kind = self._fitting(kind or self._present_kind(self._link.until(timeout_s)))
+            of_curves = curve_parameters(settings, kind)
+        self._curve, self._kind_of_curves = (*outside[0], *of_curves), kind
+        try:
+            with self._giving_back({one.name for one in of_curves} - {one.name for one in outside[0]}):
+                yield
+        finally:
+            self._curve, self._kind_of_curves = outside
 
     def _present_kind(self, until_s: float | None) -> str | None:
         response = self._commands.read(ControlRequest.PARAM, Parameter(names.SPEC_KIND), until_s)
@@ -242,18 +284,6 @@ class Scope(ExperimentView):
 
     def _spectrum_target(self, at: object, kind: str | None) -> SpectrumTarget:
         return SpectrumTarget.of(at, self._fitting(kind), self._frame, self._curve)
-
-    def _former(
-        self,
-        parameters: Sequence[str],
-        key: str | None,
-        steps: Steps = lambda now, before: (),
-        first: Parameter | None = None,
-    ) -> FormerValues:
-        return FormerValues(
-            parameters, key, link=self._link, control=self._control, commands=self._commands, targets=self._targets,
-            results=self._results, steps=steps, first=first,
-        )  # fmt: skip
 
     @checked_call
     @contextmanager
@@ -280,11 +310,12 @@ class Scope(ExperimentView):
                 for point in points:
                     print(point.values, point.scans["height"].values.std())
 
-        Control is kept over all points. If control is lost, to a tip repair for instance, the parameters of the present
-        point are set again, and the point is measured again. When the block ends, even by an error, the parameters are
-        set back to their earlier values; not after the end of the experiment or a stop of the process. In the record
-        the parameters are columns of `run.scans` and `run.spectra`. A parameter of another instrument, such as a
-        temperature, is set as its target; each point waits until the value has arrived.
+        Each measurement carries the values of its point, as in a block of `settings`: other components may measure
+        between two points, with values of their own. If control is lost in a measurement, to a tip repair for instance,
+        it is taken again. In the record the parameters are columns of `run.scans` and `run.spectra`. A parameter of
+        another instrument, such as a temperature, is set as its target; each point waits until the value has arrived.
+        Then control is kept over all points, and the former targets are set at the end of the block, even after an
+        error; not after the end of the experiment or a stop of the process.
 
         Args:
             parameters: values of each parameter: a list, or a range such as {"from": "0.5 um/s", "to": "4 um/s",
@@ -314,9 +345,9 @@ class Scope(ExperimentView):
             )
         targets: list[Target] = []
         if measure != "spectrum":
-            targets += [ScanTarget.of(one, shape, self._frame) for one in _regions(region)]
+            targets += [self._carrying(ScanTarget.of(one, shape, self._frame)) for one in _regions(region)]
         if measure != "scan":
-            targets += [self._spectrum_target(one, kind) for one in _places(at)]
+            targets += [self._carrying(self._spectrum_target(one, kind)) for one in _places(at)]
         if not targets:
             raise InvalidValue(
                 "a sweep measures nothing at its points", where="sweep", hint="list a region or position"
@@ -324,15 +355,19 @@ class Scope(ExperimentView):
         aside = None if not withdraw else () if withdraw is True else tuple(withdraw)
         targets = [replace(one, aside=aside) for one in targets]
         key = key and check_key(key)
-        former = self._former([axis.name for axis in plan.axes], key, partial(values_between, plan))
+        of_others, of_microscope = partition(axis.name for axis in plan.axes)
+        former = FormerTargets(of_others, key, self._link, self._control, self._commands, self._targets, self._results)
         sweep = ParameterSweep(plan, targets, key, former, runner=self._runner, results=self._results)
         until_s = self._link.until(timeout_s)
-        with self._control.hold(until_s=until_s, keeps=True), self._setting_back(former, timeout_s, aside):
+        # others would measure at a swept temperature
+        kept = self._control.hold(until_s=until_s, keeps=True) if of_others else nullcontext()
+        with kept, self._giving_back(of_microscope), self._setting_back(former, timeout_s, aside):
             self._sweeps = True
             try:
                 yield self._each_in_a_call(sweep.points(done, until_s))
             finally:
                 self._sweeps = False
+                self._commands.publish_settings((), "")
 
     @checked_call
     def sweep_at(
@@ -374,13 +409,15 @@ class Scope(ExperimentView):
         axis, names = SweepAxis.of(parameter, values), (read,) if isinstance(read, str) else tuple(read)
         target = SpectrumTarget.of(at, kind or parameter, self._frame)
         sweep = PlacedSweep(axis, names, target, si_or_text(settle, "s"))
-        plan, key = SweepPlan((axis,), "listed"), key and check_key(key)
-        former = self._former([parameter], key, partial(values_between, plan))
+        key = key and check_key(key)
+        of_others, of_microscope = partition([parameter])
+        former = FormerTargets(of_others, key, self._link, self._control, self._commands, self._targets, self._results)
         sweeper = PlacedSweeper(self._link, self._control, self._commands, self._targets, self._setup, self._results)
         with self._call():
             until_s = self._link.until(timeout_s)
-            with self._control.hold(until_s=until_s, keeps=True), self._setting_back(former, timeout_s):
-                result = sweeper.take(sweep, key, former, until_s)
+            with self._giving_back(of_microscope), self._control.hold(until_s=until_s, keeps=True):
+                with self._setting_back(former, timeout_s):
+                    result = sweeper.take(sweep, key, former, until_s)
                 if publish is not None:
                     publish(result.conditions, None)
                     publish(result.spectrum, f"Spec1d_{result.spectrum.kind}")
@@ -431,7 +468,9 @@ class Scope(ExperimentView):
                 held.prepare(offset)
             try:
                 with self._call():
+                    self._setup.lend(tuple(self._lent.values()), (), until_s, self._settle_s)
                     held.begin(offset, bias)
+                self._setup.holds_z = True
                 yield held
             except (ExperimentEnded, StopRequested, ControlLost):
                 raise  # the scheduler has the way back begun
@@ -439,6 +478,8 @@ class Scope(ExperimentView):
                 with suppress(RequestError):  # the first error says more
                     held.release()
                 raise
+            finally:
+                self._setup.holds_z = False
             with self._call():
                 held.release()
 
@@ -452,7 +493,7 @@ class Scope(ExperimentView):
 
     @contextmanager
     def _setting_back(
-        self, former: FormerValues, timeout_s: float | None, aside: tuple[str, ...] | None = None
+        self, former: FormerTargets, timeout_s: float | None, aside: tuple[str, ...] | None = None
     ) -> Iterator[None]:
         # aside: the tip is withdrawn for it, and moved away by these actions
         try:
@@ -466,7 +507,7 @@ class Scope(ExperimentView):
             raise
         self._set_back(former, timeout_s, aside)
 
-    def _set_back(self, former: FormerValues, timeout_s: float | None, aside: tuple[str, ...] | None) -> None:
+    def _set_back(self, former: FormerTargets, timeout_s: float | None, aside: tuple[str, ...] | None) -> None:
         try:
             with self._call():
                 until_s = self._link.until(timeout_s)
@@ -478,7 +519,7 @@ class Scope(ExperimentView):
             self._log_left_behind(former)
             raise
 
-    def _set_back_withdrawn(self, former: FormerValues, away: tuple[str, ...], until_s: float | None) -> None:
+    def _set_back_withdrawn(self, former: FormerTargets, away: tuple[str, ...], until_s: float | None) -> None:
         while True:
             try:
                 with self._control.hold(until_s=until_s, unbroken=True):
@@ -490,7 +531,7 @@ class Scope(ExperimentView):
         self._withdrawal.leave_withdrawn()
         self._link.log.info("the tip stays withdrawn, while the instruments go back")
 
-    def _log_left_behind(self, former: FormerValues) -> None:
+    def _log_left_behind(self, former: FormerTargets) -> None:
         if former.left_behind:
             self._link.log.warning("the run ended before parameters were set back to %s", former.left_behind)
 
@@ -857,6 +898,8 @@ class Scope(ExperimentView):
 
         A component's scope is closed by its loop.
         """
+        with suppress(RequestError, ExperimentEnded, StopRequested):  # the scheduler notices a client that has left
+            self._commands.give_back((), self._link.until(self._link.request_timeout_s))
         self._control.leave()
         self._link.leave()
         self._results.close()
@@ -889,6 +932,13 @@ class Scope(ExperimentView):
             response = self._link.request(kind, subject, request_id=request_id)
             if not response.ok:
                 raise refused(kind, response, self._link.name)
+
+
+def _parameters(settings: Mapping[str, Value]) -> dict[str, Parameter]:
+    if others := [name for name in settings if is_of_instrument(name)]:
+        what = f"{others[0]} belongs to another instrument, which takes its time"
+        raise InvalidValue(what, where="settings", hint="sweep it, or set it before the measurement")
+    return {name: to_parameter(name, value, None) for name, value in settings.items()}
 
 
 def _regions(given: Region | Sequence[Region] | None) -> Sequence[Region | None]:

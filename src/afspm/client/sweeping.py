@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 from afspm.basics.errors import UnitError
 from afspm.basics.units import convert
-from afspm.client.former_values import FormerValues
+from afspm.client.former_targets import FormerTargets
 from afspm.client.keyed_results import KeyedResults, MeasurementResult
 from afspm.client.measurement import MeasurementRunner
 from afspm.client.targets import Target
@@ -66,7 +66,7 @@ class ParameterSweep:
     Args:
         targets: scans and spectra to take at each point.
         key: key of the sweep; its measurements have the keys "<key>-1", "<key>-2" …
-        former: remembers the values before the first point.
+        former: remembers the targets of other instruments before the first point.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class ParameterSweep:
         plan: SweepPlan,
         targets: Sequence[Target],
         key: str | None,
-        former: FormerValues,
+        former: FormerTargets,
         *,
         runner: MeasurementRunner,
         results: KeyedResults,
@@ -98,17 +98,6 @@ class ParameterSweep:
             in_force = _shown(self._plan, result.conditions)
             values = self._plan.values(places)
             yield SweepPoint(index + 1, len(each), point, key or "", values, in_force, result)
-
-
-def values_between(plan: SweepPlan, now: Parameter, before: Parameter) -> list[Parameter]:
-    """Return the values of a plan between the present value of a parameter and the one before the sweep, in order."""
-    axis = next(axis for axis in plan.axes if axis.name == before.name)
-    ends = [_number(one, axis.unit) for one in (now, before)]
-    if None in ends or axis.in_steps() is axis:  # texts or switches have no order
-        return []
-    low, high = sorted(end for end in ends if end is not None)
-    between = {value: place for place, value in enumerate(axis.values) if low < float(value) < high}
-    return [axis.parameter(between[value]) for value in sorted(between, key=float, reverse=ends[0] == high)]
 
 
 def _shown(plan: SweepPlan, conditions: MeasurementConditions | None) -> dict[str, ValueInForce]:

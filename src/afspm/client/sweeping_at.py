@@ -11,7 +11,7 @@ from afspm.basics.plain_data import Plain
 from afspm.client.command_retry import PATIENCE_S, RETRY_S, CommandRetry, refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import ExperimentLink
-from afspm.client.former_values import FormerValues
+from afspm.client.former_targets import FormerTargets
 from afspm.client.instrument_targets import InstrumentTargets
 from afspm.client.keyed_results import KeyedResults, MeasurementResult
 from afspm.client.measurement_setup import MeasurementSetup
@@ -83,7 +83,7 @@ class PlacedSweeper:
         self._targets, self._setup, self._results = targets, setup, results
 
     def take(
-        self, sweep: PlacedSweep, key: str | None, former: FormerValues, until_s: float | None
+        self, sweep: PlacedSweep, key: str | None, former: FormerTargets, until_s: float | None
     ) -> MeasurementResult:
         """Return the sweep's spectrum, and the conditions to publish with it; with a key, it is taken only once.
 
@@ -136,7 +136,7 @@ class PlacedSweeper:
     def _set(self, wanted: Parameter, until_s: float | None) -> Parameter:
         if is_of_instrument(wanted.name):
             return self._targets.reach(wanted, until_s)
-        return self._commands.set_parameter(wanted, until_s)
+        return self._setup.lend((), (wanted,), until_s, 0.0).get(wanted.name, wanted)
 
     def _settle(self, settle_s: float) -> None:
         clock = self._link.clock

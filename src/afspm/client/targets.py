@@ -29,7 +29,9 @@ class ScanTarget:
 
     Attributes:
         shape: (rows, columns).
-        settings: parameters of a sweep, set before each attempt.
+        settings: the settings that this measurement states.
+        lent: the settings of the blocks around it.
+        settle_s: experiment time after a change of bias, setpoint or gains; None: as in [control].
         point: number of the sweep's point; None outside of a sweep.
         aside: the actions (none, too) that move a withdrawn tip away while another instrument goes to its target;
             None: the tip stays.
@@ -38,6 +40,8 @@ class ScanTarget:
     region: Region | None
     shape: tuple[int, int] | None
     settings: tuple[Parameter, ...] = ()
+    lent: tuple[Parameter, ...] = ()
+    settle_s: float | None = None
     point: int | None = None
     aside: tuple[str, ...] | None = None
 
@@ -97,7 +101,9 @@ class SpectrumTarget:
     """A spectrum to take; None keeps the present kind or position of the probe.
 
     Attributes:
-        settings: parameters of the curve or of a sweep, set before each attempt.
+        settings: the settings that this measurement states, such as those of its curve.
+        lent: the settings of the blocks around it.
+        settle_s: experiment time after a change of bias, setpoint or gains; None: as in [control].
         point: number of the sweep's point; None outside of a sweep.
         aside: the actions (none, too) that move a withdrawn tip away while another instrument goes to its target;
             None: the tip stays.
@@ -107,6 +113,8 @@ class SpectrumTarget:
     kind: str | None
     frame: Frame = Frame.TIP
     settings: tuple[Parameter, ...] = ()
+    lent: tuple[Parameter, ...] = ()
+    settle_s: float | None = None
     point: int | None = None
     aside: tuple[str, ...] | None = None
 
@@ -149,7 +157,8 @@ Target = ScanTarget | SpectrumTarget
 
 def _facts(target: Target) -> Plain:
     facts = to_plain(target)
-    del facts["point"], facts["aside"]  # the key has the number; how a target is reached changes no result
+    # the key has the number; how a target is reached changes no result, and a block may be edited before a resume
+    del facts["point"], facts["aside"], facts["lent"], facts["settle_s"]
     if not target.settings:
         del facts["settings"]
     return {"what": target.what, **facts}

@@ -61,7 +61,8 @@ class PlannedScans(Component):
     Args:
         keep_control: whether to keep control between scans; by default others may measure meanwhile.
         end_when_done: whether to end the whole experiment after the last scan.
-        parameters: parameters to set before the first scan, e.g. {scan-speed = "2 um/s"}.
+        parameters: the settings of each scan, e.g. {scan-speed = "2 um/s"}: set right before it, and set back for the
+            measurements of other components.
         missed: treatment of scans that were due while control was lost (MANUAL, the repair of a tip). "extend": they
             are taken after the others, with the same period; "catch-up": at once, one after the other; "skip": never;
             "rest": as "extend", and of a scan that a `LineWatch` stopped only the rows since the change are taken.
@@ -111,14 +112,13 @@ class PlannedScans(Component):
         rhythm = RoundSchedule(float(self.memory["start_s"]), self.beat_s)
         self.memory.save()
         self._pace = Pace(self.scope, self.memory)
-        self._set_parameters()
         done = int(self.memory.get("done", 0))
         if done and done != self._total:
             self.log.info("going on with scan %d%s", done + 1, self._of_total())
         self._retakes = Retakes(self.retakes, self.memory)
         self._refused = RefusedPlaces(len(self.plan.regions), self.memory)
         self._verdicts = self.scope.events(tip_verdict.MESSAGE) if self.retakes else None
-        with self.scope.control() if self.keep_control else nullcontext():
+        with self.scope.control() if self.keep_control else nullcontext(), self.scope.settings(self.parameters):
             for step in self.plan.steps(done):
                 if not self._await(step, rhythm):
                     break
@@ -136,13 +136,6 @@ class PlannedScans(Component):
         self.log.info("%s taken%s", taken, f"; the time of {left_out} had passed" if left_out else "")
         if self.end_when_done:
             self.scope.end_experiment()
-
-    def _set_parameters(self) -> None:
-        if not self.parameters:
-            return  # control would be released, perhaps in a scan from before a restart: no flag would stop that scan
-        with self.scope.control(), self.clock.late():
-            for name, quantity in self.parameters.items():
-                self.scope.set(name, quantity)
 
     def _await(self, step: PlanStep, rhythm: RoundSchedule) -> bool:
         if not step.starts_round or self.memory.get("begun") == step.index:

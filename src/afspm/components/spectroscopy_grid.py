@@ -94,7 +94,7 @@ class SpectroscopyGrid(Component):
 
     def run(self) -> None:
         kept = self.scope.control() if self.keep_control else nullcontext()
-        with kept, self.scope.curves(self.curve, kind=self.kind, key="curve"):
+        with kept, self.scope.curves(self.curve, kind=self.kind):
             refused = self._measure()
         if refused:
             self.log.error("%d of %d spectra were refused", refused, len(self.positions) * self.repeats)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -178,30 +178,21 @@ class Survey(Component):
     def run(self) -> None:
         with (
             self.scope.control() if self.keep_control else nullcontext(),
-            self.scope.curves(self.curve, kind=self.kind, key="curve"),
+            self.scope.curves(self.curve, kind=self.kind),
             self.scope.events(MAPPING, timeout_s=0.0) as mappings,
+            self.scope.settings(self._wide.parameters),
         ):
             self._run(mappings)
         if self.end_when_done:
             self.scope.end_experiment()
 
     def _run(self, mappings: Events) -> None:
-        self._set(self._wide.parameters)
         survey = self._channel(self.scope.scan(self._wide.region, shape=self._wide.shape, key="survey"))
         self._record = SurveyRecord(survey, self._targets(survey), tuple(self.curves))
         self._keep(self._record)
         visits = self._record.visits
-        self._set(self._closer.parameters if visits else {})
-        pace = Pace(self.scope, self.memory)
-        for visit in visits:
-            self._visit(visit, mappings)
-            self._keep(self._record)
-            pace.note()
-            self.scope.progress(visit.number, len(visits), left_s=pace.left_s(visit.number, len(visits)))
-            if visit.number > int(self.memory.get("done", 0)):  # else it was logged before a restart
-                self._tell(visit, self._record.outcome(visit))
-                self.memory["done"] = visit.number
-                self.memory.save()
+        with self.scope.settings(self._closer.parameters):
+            self._visit_all(self._record, mappings)
         registered = [visit.registration for visit in visits if visit.registration]
         if registered:
             level = logging.INFO if all(one.is_registered for one in registered) else logging.WARNING
@@ -210,6 +201,18 @@ class Survey(Component):
             assert self._refused is not None
             self.log.error("no target could be zoomed: all %d were refused", len(visits))
             raise self._refused
+
+    def _visit_all(self, record: SurveyRecord, mappings: Events) -> None:
+        visits, pace = record.visits, Pace(self.scope, self.memory)
+        for visit in visits:
+            self._visit(visit, mappings)
+            self._keep(record)
+            pace.note()
+            self.scope.progress(visit.number, len(visits), left_s=pace.left_s(visit.number, len(visits)))
+            if visit.number > int(self.memory.get("done", 0)):  # else it was logged before a restart
+                self._tell(visit, record.outcome(visit))
+                self.memory["done"] = visit.number
+                self.memory.save()
 
     def on_end(self) -> None:
         if self._record is None:
@@ -224,12 +227,6 @@ class Survey(Component):
         for suffix in (".png", ".pdf"):  # the second for `afspm export --to pdf`: the record does not have all of it
             save_figure(drawn, path.with_suffix(suffix), figure.DPI)
         self.log.info("the survey is drawn: %s", path)
-
-    def _set(self, parameters: Mapping[str, str | float]) -> None:
-        if parameters:
-            with self.scope.control(), self.clock.late():
-                for name, quantity in parameters.items():
-                    self.scope.set(name, quantity)
 
     def _targets(self, survey: Scan) -> list[Target]:
         # saved, so that they are the same after a restart: a user's function may be random

@@ -220,7 +220,7 @@ class Sweep(Component):
         if 0 < done < total:
             self.log.info("going on with %s %d of %d", what, done + 1, total)
         with (
-            self.scope.curves(self.curve, kind=self.kind, key="curve"),
+            self.scope.curves(self.curve, kind=self.kind),
             self.scope.sweep(**self._given, **self._what, measure=self.measure, key=KEY, done=done) as points,
         ):
             for point in points:

@@ -89,6 +89,7 @@ PULSE_VOLTAGE: Final = "x-pulse-voltage"
 PULSE_DURATION: Final = "x-pulse-duration"
 CRASH_SPEED: Final = "x-crash-speed"
 CRASH_DEPTH: Final = "x-crash-depth"
+OF_TREATMENTS: Final = (PULSE_VOLTAGE, PULSE_DURATION, CRASH_SPEED, CRASH_DEPTH)
 SPEC_KIND: Final = "x-spec-kind"
 
 # A curve: the ends of its sweep, its points, and the lock-in amplifier.
@@ -169,3 +170,11 @@ EXTENSION_PARAMETERS: Final = (
 # Velocity with which a controller moves its tip to follow a drifting sample.
 DRIFT_RATE_X: Final = "x-drift-rate-x"
 DRIFT_RATE_Y: Final = "x-drift-rate-y"
+
+MAY_BE_LENT: Final = frozenset(
+    (
+        TIP_BIAS_VOLTAGE, SAMPLE_BIAS, ZCTRL_SETPOINT, ZCTRL_PGAIN, ZCTRL_IGAIN, SCAN_SPEED, SCAN_DIRECTION,
+        *OF_CURVES, *OF_TREATMENTS,
+    )
+)  # fmt: skip
+"""The parameters that a measurement may carry: they neither move the tip nor change what other numbers mean."""

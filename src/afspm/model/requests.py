@@ -52,6 +52,20 @@ GRANT_REQUEST = 105
 The subject is a Grant.
 """
 
+LEND_REQUEST = 106
+"""Request of the holder to set what its next measurement states; an extension of afspm.
+
+The subject is `Settings`; the answer holds them with the values in force. The scheduler sets the former values back for
+the measurements that do not state them.
+"""
+RETURN_REQUEST = 107
+"""Request of a lender, which needs no control, to set back what it has lent; an extension of afspm.
+
+The subject is `Settings` without values; without settings, all that the client has lent.
+"""
+COMPARE_REQUEST = 108
+"""Request of the scheduler to a translator: which of the known values are in force; an extension of afspm."""
+
 OTHER_RUN_RESPONSE = 100
 """Response to a component of another run than the scheduler's run; an extension of afspm."""
 
@@ -61,6 +75,9 @@ _OURS = {
     RESTART_REQUEST: "RESTART",
     LEASE_REQUEST: "LEASE",
     GRANT_REQUEST: "GRANT",
+    LEND_REQUEST: "LEND",
+    RETURN_REQUEST: "RETURN",
+    COMPARE_REQUEST: "COMPARE",
 }
 
 
@@ -119,6 +136,43 @@ class Parameter:
     unit: str | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """A setting of a measurement, in a request to lend, return or compare it, or in the answer.
+
+    Attributes:
+        parameter: to lend: with its value; to return or compare: without; in an answer: the value in force.
+        known: to compare: values that may be in force; in the answer those that are, within the controller's precision.
+        is_claimed: whether the next measurement stands for the first of `known`, if that is in force.
+        is_lent: in an answer, whether the parameter may be lent; None: unknown to the translator.
+    """
+
+    parameter: Parameter
+    known: tuple[Parameter, ...] = ()
+    is_claimed: bool = False
+    is_lent: bool | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """The settings of a measurement.
+
+    Attributes:
+        settle_s: experiment time to wait after a change of bias, setpoint or gains; None: as in [control].
+    """
+
+    settings: tuple[Setting, ...] = ()
+    settle_s: float | None = None
+
+    @classmethod
+    def of(cls, *parameters: Parameter, settle_s: float | None = None) -> Settings:
+        return cls(tuple(map(Setting, parameters)), settle_s)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return tuple(one.parameter for one in self.settings)
+
+
 @dataclass(slots=True)
 class Request:
     """A request to scheduler or translator.
@@ -154,6 +208,8 @@ class ResponseDetail(IntEnum):
     EXPERIMENT_ENDED = 3
     STEP_AWAY_AGAIN = 4
     """The steps away from the sample count no more, since others may have used the coarse motor; new ones do."""
+    STATE_AGAIN = 5
+    """Something that the client has stated for its measurement is not in force any more: state it again."""
 
 
 @dataclass(slots=True)

@@ -11,6 +11,7 @@ from afspm.model.instruments import GivenOrder
 from afspm.model.microscope_status import TipRisk
 from afspm.scheduler.control.arbitration import ArbitrationState
 from afspm.scheduler.control.panel_state import PanelState
+from afspm.scheduler.loans import Loan
 from afspm.scheduler.publishing.event_log import SentStart
 from afspm.scheduler.safety.grants import GrantBook
 from afspm.scheduler.safety.limit_state import LimitState
@@ -49,6 +50,8 @@ class SavedState:
         frame: the result of `CoordinateFrame.saved`; as plain data if the state was read from a file.
         instrument_units: the first unit of each parameter of an instrument.
         instrument_orders: the number of the newest order or token.
+        loans: the settings that were lent, by key.
+        lent_last: see `loans.LoanBook`.
         given_orders: the orders that may still be carried out, or whose value is on its way.
     """
 
@@ -71,6 +74,8 @@ class SavedState:
     given_orders: tuple[GivenOrder, ...] = ()
     grants: GrantBook = field(default_factory=GrantBook)
     panel: PanelState = field(default_factory=PanelState)
+    loans: Mapping[str, Loan] = field(default_factory=dict)
+    lent_last: str = ""
 
     def without_holder(self) -> SavedState:
         """Return the state without a holder: an older state does not know the present holder."""

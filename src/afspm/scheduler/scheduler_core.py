@@ -61,7 +61,7 @@ from afspm.scheduler.publishing import own_packets as publishing
 from afspm.scheduler.publishing import packet_intake
 from afspm.scheduler.publishing.cache import TIME_STEP_NS, PacketCache
 from afspm.scheduler.publishing.event_log import SCHEDULER, SentStart, start_entry, unreadable_entry
-from afspm.scheduler.requests import answers, approvals, instrument_requests, request_pipeline
+from afspm.scheduler.requests import answers, approvals, instrument_requests, lending, request_pipeline
 from afspm.scheduler.requests.forwarder import AskForFrame
 from afspm.scheduler.safety import safety_commands
 from afspm.scheduler.safety.forbidden_states import STARTED, PresentState
@@ -84,6 +84,7 @@ def step(
     _dispatch(draft, event)
     while draft.raised:
         _dispatch(draft, draft.raised.pop(0))
+    lending.begin_returns(draft)
     request_pipeline.send_next(draft)
     if draft.control is not state.control:
         _dispatch(draft, ControlChanged(state.control, draft.control))
@@ -108,6 +109,7 @@ def due_s(state: SchedulerState) -> float | None:
         _entries_due_s(state),
         _holder_dead_at_s(state),
         _lease_ends_at_s(state),
+        lending.due_s(state),
         _AT_ONCE_S if _is_restarted_too_often(state) else None,
     )
     return min((one_s for one_s in dues if one_s is not None), default=None)
@@ -186,13 +188,16 @@ class SchedulerCore:
     def deadline_ns(self) -> int | None:
         """Return when a Tick is due at the latest, in experiment time; None: no deadline.
 
-        Deadlines are a lease of the experiment file, and the end of an approval: of the agent in control, or of a
-        running measurement.
+        Deadlines are a lease of the experiment file, the end of an approval (of the agent in control, or of a running
+        measurement), the end of the wait for settings, and the return of lent ones.
         """
         lease_ns = self.state.lease.deadline_ns(is_free=self.state.microscope.is_free)
         approved_ns = self.state.grants.ends_ns(self.state.control.holder)
         measured_ns = approvals.measurement_ends_ns(self.state)
-        return min((one for one in (lease_ns, approved_ns, measured_ns) if one is not None), default=None)
+        settles_ns = self.state.pending.settles_ns
+        returns_ns = lending.return_due_ns(self.state.loans, self._env.settings.control.return_after_s)
+        dues = (lease_ns, approved_ns, measured_ns, settles_ns, returns_ns)
+        return min((one for one in dues if one is not None), default=None)
 
     def snapshot(self) -> SavedState:
         """Return the state that must survive a kill, without the cache."""
@@ -304,6 +309,7 @@ def _on_translator_up(draft: StateDraft, event: TranslatorUp) -> None:
     for one in settled:
         request_pipeline.settle(draft, one)
     draft.others_may_have_acted(unseen=True)
+    draft.loans = replace(draft.loans, is_compared=True)
     safety_commands.begin(draft)
     request_pipeline.read_ahead(draft)
 
@@ -375,11 +381,15 @@ def _on_stopped(draft: StateDraft, event: Stopped) -> None:
 
 def _end_when_safe(draft: StateDraft) -> None:
     owes_retract, kept = draft.watchdog.owes_retract, draft.end.kept
-    if not draft.end.is_due(draft.now_s, owes_retract=owes_retract):
+    is_lent = lending.is_to_return(draft.loans) and lending.may_return(draft)
+    if not draft.end.is_due(draft.now_s, waits=owes_retract or is_lent):
         return
     draft.end = draft.end.ended(draft.now_s)
     if owes_retract:
         draft.log("CRITICAL", "the experiment ended with the tip in danger: the microscope did not retract it")
+    for loan in draft.loans.loans.values():
+        why = f": {loan.why}" if loan.why else ""
+        draft.log("WARNING", f"the experiment ended with {loan.text}; it was not set back{why}")
     for event, code, why, detail in kept:
         newest = draft.peers.sessions.connection_of(event.name)
         # a client that lost its connection repeats its request over a new one

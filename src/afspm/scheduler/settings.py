@@ -59,6 +59,10 @@ class ControlSettings:
             `feedback-off`; without the key `COARSE_MOTOR` and `feedback-off`.
         request_timeout_s: real time after which a request counts as unanswered.
         request_retries: how often an unanswered request is sent again; it is never executed twice.
+        settle_s: experiment time after a change of bias, setpoint or gains with the tip at the sample, before a
+            measurement begins that states other settings than the one before.
+        return_after_s: experiment time for which the microscope may be free until settings of a measurement are set
+            back to the values of before.
         adjustable: parameters that a person sets in AUTOMATED as well, beside the component in control, while no
             problem is flagged: any of `zctrl-setpoint`, `zctrl-pgain`, `zctrl-igain`, `tip-bias-voltage`. The
             translator sets them during a scan, too; they hold from the next line on.
@@ -84,6 +88,8 @@ class ControlSettings:
     dangerous: tuple[DangerousState, ...] | None = None
     request_timeout_s: PositiveDuration = 5.0
     request_retries: WholeNumber = 3
+    settle_s: Duration = 0.5
+    return_after_s: PositiveDuration = 600.0
     adjustable: tuple[AdjustableParameter, ...] = ()
     idle: Literal["end", "stay"] = "end"
     solved_by_hand: tuple[str, ...] = ("device-malfunction",)

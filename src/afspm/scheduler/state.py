@@ -19,6 +19,7 @@ from afspm.scheduler.control.supervisor_registry import SupervisorRegistry
 from afspm.scheduler.coordinate_frame import TIP_FRAME, CoordinateFrame
 from afspm.scheduler.events import Codec, Effect, FrameAnswered, Log, SaveState
 from afspm.scheduler.instruments.known_instruments import Instruments
+from afspm.scheduler.loans import LoanBook
 from afspm.scheduler.publishing.cache import PacketCache
 from afspm.scheduler.publishing.event_log import EventLog
 from afspm.scheduler.requests.forwarder import Forwarder
@@ -81,6 +82,7 @@ class SchedulerState:
     logged: frozenset[str]
     frame: CoordinateFrame
     grants: GrantChecker
+    loans: LoanBook
 
     @classmethod
     def initial(cls, settings: SchedulerSettings, frame: CoordinateFrame = TIP_FRAME) -> SchedulerState:
@@ -107,6 +109,7 @@ class SchedulerState:
             logged=frozenset(),
             frame=frame,
             grants=GrantChecker(settings.rules, settings.limits, settings.run.name),
+            loans=LoanBook(),
         )
 
     def saved_parts(self) -> tuple[object, ...]:
@@ -122,6 +125,8 @@ class SchedulerState:
             self.event_log.starts,
             self.instruments.units,
             self.instruments.given,
+            self.loans.loans,
+            self.loans.lent_last,
         )
 
     def due_s(self) -> float | None:
@@ -175,6 +180,7 @@ class StateParts:
     logged: frozenset[str]
     frame: CoordinateFrame
     grants: GrantChecker
+    loans: LoanBook
 
 
 _PARTS = tuple(one.name for one in fields(SchedulerState))
@@ -205,13 +211,17 @@ class StateDraft(StateParts):
         self._is_to_be_saved = True
 
     def others_may_have_acted(self, *, unseen: bool = False, by: str = "") -> None:
-        """Forget where the tip and its motor are. The arguments are those of `MoverState.unknown`."""
+        """Forget where the tip and its motor are, and which settings are in force.
+
+        The arguments are those of `MoverState.unknown`.
+        """
         shown, said_s = self.panel.tip.engaged, self.limits.state.movers.cleared_s
         by = by if self.now_s - said_s < _WORD_S else ""
         self.limits = self.limits.with_movers(partial(MoverState.unknown, engaged=shown, unseen=unseen, by=by))
         if shown is not False:
             self.microscope = self.microscope.with_tip(away=False)
         self.instruments = self.instruments.changed(self.now_s)
+        self.loans = self.loans.broken() if unseen else self.loans.unsure()
 
     def log(self, level: str, text: str) -> None:
         self.effects.append(Log(level, text))
@@ -256,6 +266,8 @@ def saved_state(state: SchedulerState, env: Environment) -> SavedState:
         given_orders=state.instruments.given,
         grants=state.grants.book,
         panel=state.panel,
+        loans=state.loans.loans,
+        lent_last=state.loans.lent_last,
     )
 
 
@@ -291,4 +303,5 @@ def restored_state(
         ),
         grants=replace(state.grants, book=saved.grants),
         panel=saved.panel,
+        loans=LoanBook(saved.loans, lent_last=saved.lent_last),
     )

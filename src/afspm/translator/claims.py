@@ -67,6 +67,34 @@ class Claims:
             for name in own:
                 self._kept["running"]["values"].pop(name, None)
 
+    def compared(self, claimed: Mapping[str, Value], others: Collection[str]) -> None:
+        """Note what the next measurement stands for; it begins with these values, or not at all.
+
+        Args:
+            claimed: the values that it states, those in force alone.
+            others: what was compared, and is not stated.
+        """
+        kept = self._kept
+        for name in others:
+            kept["next"].pop(name, None)
+        kept["stated"] = [name for name in kept.get("stated", ()) if name not in others]
+        kept["stated"] += [name for name in claimed if name not in kept["stated"]]
+        self.is_set(claimed)
+
+    def not_as_stated(self) -> str:
+        """Return why a measurement may not begin: a value that it states is not in force. It is claimed no more."""
+        asked = self._kept["asked"]
+        if asked is None or not self._kept.get("stated"):
+            return ""
+        claim, stated = Claim.of(asked), set(self._kept["stated"])
+        claim = replace(claim, values={name: value for name, value in claim.values.items() if name in stated})
+        changed = self._differences(claim, {})
+        for name in changed:
+            self._kept["next"].pop(name, None)
+            self._kept["asked"]["values"].pop(name, None)
+            self._kept["stated"].remove(name)
+        return "; ".join(changed.values())
+
     def asks(self, request: Request, values: Mapping[str, Value]) -> None:
         """Note the settings in force right before a measurement is asked for.
 
@@ -97,6 +125,7 @@ class Claims:
         if asked is not None:
             claim = replace(Claim.of(asked), began_ns=began_ns, tip=tip)
             self._kept["next"] = {}
+            self._kept["stated"] = []
         else:  # at the panel; a spectrum sweeps its settings by now
             is_scan = doing is ScopeState.SCANNING
             known = values if is_scan else {}

@@ -14,8 +14,22 @@ from typing import Any
 from afspm.basics import units
 from afspm.basics.errors import AfspmError, ConfigError, InvalidValue, Refused
 from afspm.basics.plain_data import PlainMapping
-from afspm.model import ControlRequest, ControlResponse, Parameter, Request, Response, ScopeState, names, request_name
+from afspm.model import (
+    COMPARE_REQUEST,
+    ControlRequest,
+    ControlResponse,
+    Parameter,
+    Request,
+    Response,
+    ResponseDetail,
+    ScopeState,
+    Setting,
+    Settings,
+    names,
+    request_name,
+)
 from afspm.model.microscope_status import STARTS
+from afspm.translator.claims import Claims
 from afspm.translator.driver_base import LOST, Action, DriverBase
 from afspm.translator.hurry import unhurried
 from afspm.translator.panel_watch import PanelWatch
@@ -49,6 +63,10 @@ class CommandOutcome:
     announce: tuple[str, ...] = ()
 
 
+class StateAgain(Refused):
+    """The refusal of a measurement whose settings are not in force any more; its client states them again."""
+
+
 class Commands:
     """The executor of requests to one microscope.
 
@@ -57,6 +75,7 @@ class Commands:
         sequence: decides whether the microscope is free, and the order of published states.
         about_to_act: called after all checks, right before the first change.
         is_set: called with the values that a request has set, as read back.
+        claims: knows what the next measurement states.
     """
 
     def __init__(
@@ -67,9 +86,11 @@ class Commands:
         panel: PanelWatch,
         about_to_act: Callable[[Request], None],
         is_set: Callable[[Mapping[str, Value]], None],
+        claims: Claims,
         log: logging.Logger,
     ) -> None:
         self._driver = driver
+        self._claims = claims
         self._sequence = sequence
         self._temporary = temporary
         self._panel = panel
@@ -91,6 +112,9 @@ class Commands:
         """
         try:
             return self._dispatch(request)
+        except StateAgain as refused:
+            again = ResponseDetail.STATE_AGAIN
+            return CommandOutcome(Response(refused.response, b"", refused.reason, request.id, again))
         except Refused as refused:
             return CommandOutcome(Response(refused.response, reason=refused.reason, id=request.id))
         except LOST:
@@ -115,6 +139,8 @@ class Commands:
             return self._success(request)
         if request.kind == ControlRequest.ACTION:
             return self._act(request)
+        if request.kind == COMPARE_REQUEST:
+            return self._compare(request)
         if request.kind not in _SETTERS:
             reason = f"{request_name(request.kind)} is not for a translator"
             raise Refused(ControlResponse.CMD_NOT_SUPPORTED, reason)
@@ -130,6 +156,38 @@ class Commands:
             text, unit = spec.for_peer(in_force[spec.name], asked.unit)
             payload = encode(Parameter(spec.name, text, unit or None))[1]
         return CommandOutcome(Response(ControlResponse.SUCCESS, payload, id=request.id))
+
+    def _compare(self, request: Request) -> CommandOutcome:
+        # what the microscope does not show is left out of the answer
+        table, asked = self._driver.table, {one.parameter.name: one for one in request.subject.settings}
+        values = self._driver.reported([name for name in asked if name in table])
+        claimed, found = dict[str, Value](), list[Setting]()
+        for name, value in values.items():
+            spec, one = table[name], asked[name]
+            # a sweep may be finer than the resolution of a reading: a value that is new is set
+            exact = one.known[:1] if one.is_claimed else ()
+            known = tuple(
+                there
+                for there in (*one.known[len(exact) :], *exact)
+                if self._is_there(there, value, None if there in exact else values)
+            )
+            if any(there in known for there in exact):
+                claimed[name] = value
+            text, unit = spec.for_peer(value, one.parameter.unit)
+            found.append(Setting(Parameter(name, text, unit or None), known, is_lent=spec.may_be_lent))
+        self._claims.compared(claimed, [name for name, one in asked.items() if not one.is_claimed])
+        return CommandOutcome(Response(ControlResponse.SUCCESS, encode(Settings(tuple(found)))[1], id=request.id))
+
+    def _is_there(self, there: Parameter, value: Value, among: Mapping[str, Value] | None) -> bool:
+        # among: the values read together with it, for the precision of a reading; None: exactly
+        spec = replace(self._driver.table[there.name], range=(-math.inf, math.inf), choices=())
+        try:
+            wanted = spec.parse(there.value or "", there.unit)
+        except Refused:  # no value of this parameter: it can't be in force, and is refused when it is set
+            return False
+        if among is None:
+            return replace(spec, resolution=0.0).same(value, wanted)
+        return self._driver.same(there.name, value, wanted, among)
 
     def _set(self, request: Request, values: Mapping[str, Value]) -> CommandOutcome:
         driver = self._driver
@@ -174,6 +232,8 @@ class Commands:
         if action.name in STARTS:
             self._refuse_without_tip()
             treatment.refuse_start()
+            if why := self._claims.not_as_stated():
+                raise StateAgain(ControlResponse.NOT_FREE, why)
             held.moves_aside()
         if action.needs_withdrawn:
             self._refuse_at_sample()

@@ -50,6 +50,8 @@ class ParameterSpec:
         resolution: smaller differences are ignored (rounding by the controller, noise of a read-back), in SI.
         measured: a reading is a measured value, and not the setting: no measurement stands for it.
         multiple: for an "int", the step of the accepted values, from 0: 16 accepts 16, 32, 48 …
+        lent: a measurement may carry it: it is set for the measurement, and set back after it; None: the parameters of
+            `names.MAY_BE_LENT` alone.
         watched: a change by a person is published and recorded, as one of bias, setpoint and frame always is.
         where: the place where `range` was set; empty without a range.
     """
@@ -67,7 +69,12 @@ class ParameterSpec:
     measured: bool = False
     multiple: int = 1
     watched: bool = False
+    lent: bool | None = None
     where: str = ""
+
+    @property
+    def may_be_lent(self) -> bool:
+        return not self.read_only and (self.name in names.MAY_BE_LENT if self.lent is None else self.lent)
 
     @property
     def si_unit(self) -> str:
@@ -360,7 +367,7 @@ def _row(known: ParameterSpec, given: PlainMapping, where: str, *, translated: b
     multiple = values.get("multiple", 1)
     if isinstance(multiple, bool) or not isinstance(multiple, int) or multiple < 1:
         raise ConfigError(f"multiple must be a whole number from 1 on, not {multiple!r}", where=at)
-    for key in ("read_only", "while_busy", "watched"):
+    for key in ("read_only", "while_busy", "watched", "lent"):
         if not isinstance(values.get(key, False), bool):
             raise ConfigError(f"{key} must be true or false, not {values[key]!r}", where=at)
     if "choices" in values:

@@ -12,6 +12,7 @@ from functools import partial
 from afspm import wire
 from afspm.basics.errors import WireError
 from afspm.model import (
+    COMPARE_REQUEST,
     ControlRequest,
     ControlResponse,
     Parameter,
@@ -73,8 +74,9 @@ class RequestHandler:
         self._is_connected = is_connected
         self._reply = reply
         self._outcomes = RequestOutcomes(state.kept, all_or_nothing=driver.memory_is_all)
-        is_set = observer.is_set
-        self.commands = Commands(driver, state.sequence, temporary, observer.panel, self._record_begin, is_set, log)
+        self.commands = Commands(
+            driver, state.sequence, temporary, observer.panel, self._record_begin, observer.is_set, observer.claims, log
+        )
         self._log = log
         self._acting: Request | None = None
         self.withdraws = False
@@ -222,7 +224,7 @@ def is_withdrawal(request: Request) -> bool:
 def _is_read_only(request: Request) -> bool:
     if request.kind == ControlRequest.PARAM:
         return isinstance(request.subject, Parameter) and request.subject.value is None
-    return request.kind == ControlRequest.ACTION_SUPPORT
+    return request.kind in (ControlRequest.ACTION_SUPPORT, COMPARE_REQUEST)
 
 
 class RequestOutcomes:

@@ -13,10 +13,13 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from afspm.basics.errors import AfspmError, InvalidValue, WireError
 from afspm.model import (
     CLOCK_REQUEST,
+    COMPARE_REQUEST,
     GRANT_REQUEST,
     LEASE_REQUEST,
+    LEND_REQUEST,
     RELAY_REQUEST,
     RESTART_REQUEST,
+    RETURN_REQUEST,
     ControlRequest,
     ControlResponse,
     Packet,
@@ -30,7 +33,7 @@ from afspm.model.requests import LONGEST_LEASE_S
 from afspm.wire import unit_conversion
 from afspm.wire.codec import encode
 from afspm.wire.generated import control_pb2, scan_pb2, spectroscopy_pb2
-from afspm.wire.mapping import FEEDBACK, GRANT, PARAMETER, RELAYED, known, time_ns, timestamp
+from afspm.wire.mapping import FEEDBACK, GRANT, PARAMETER, RELAYED, SETTINGS, known, time_ns, timestamp
 from afspm.wire.messages import parse
 from afspm.wire.split import Buffer
 
@@ -256,5 +259,8 @@ _SUBJECTS: dict[int, Callable[[bytes], object]] = {
     RESTART_REQUEST: _action,
     LEASE_REQUEST: _seconds,
     GRANT_REQUEST: GRANT.decode,
+    LEND_REQUEST: SETTINGS.decode,
+    RETURN_REQUEST: SETTINGS.decode,
+    COMPARE_REQUEST: SETTINGS.decode,
     ControlRequest.ACTION_SUPPORT: _action,
 }

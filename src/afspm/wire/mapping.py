@@ -28,6 +28,7 @@ from afspm.wire.generated import (
     grants_pb2,
     instruments_pb2,
     journal_pb2,
+    loans_pb2,
     panel_pb2,
 )
 from afspm.wire.messages import parse
@@ -160,6 +161,12 @@ def _gain(name: str) -> FieldMapping:
     return FieldMapping(name, from_wire=finite)
 
 
+def _wait(settle_s: float) -> float:
+    if not 0.0 <= settle_s < math.inf:
+        raise InvalidValue(f"a wait of {settle_s} s", hint="zero or more")
+    return settle_s
+
+
 def _needed(what: str) -> Callable[[str], str]:
     def checked(name: str) -> str:
         if not name:
@@ -236,7 +243,7 @@ _NOTE = MessageMapping(
     scan_ns=_time("scan"),
     written_ns=_time("written"),
 )
-_SETTINGS = MessageMapping(
+_SWEPT = MessageMapping(
     MeasurementSettings,
     journal_pb2.MeasurementSettings,
     *("who", "point"),
@@ -269,6 +276,20 @@ RELAYED = MessageMapping(
     model.RelayedMessage, journal_pb2.Told, "payload", message=FieldMapping("message", from_wire=_needed("a message"))
 )
 INSTRUMENT_ORDERS = MessageMapping(InstrumentOrders, journal_pb2.Orders, "token", orders=_each("instrument", _ORDER))
+_SETTING = MessageMapping(
+    model.Setting,
+    loans_pb2.LentSetting,
+    parameter=FieldMapping("parameter", PARAMETER.to_wire, PARAMETER.from_wire),
+    known=_each("known", PARAMETER),
+    is_claimed=FieldMapping("claimed", sparse=True),
+    is_lent="lent",
+)
+SETTINGS = MessageMapping(
+    model.Settings,
+    loans_pb2.LentSettings,
+    settings=_each("settings", _SETTING),
+    settle_s=FieldMapping("settle", from_wire=_wait),
+)
 _COUNT = MessageMapping(model.GrantedCount, grants_pb2.GrantedCount, "action", "count")
 _RANGE = MessageMapping(model.GrantedRange, grants_pb2.GrantedRange, "parameter", "low", "high")
 GRANT = MessageMapping(
@@ -381,7 +402,8 @@ MAPPINGS: tuple[MessageMapping[Any], ...] = (
     MessageMapping(LogLines, journal_pb2.LogLines, lines=_each("lines", _LOG_LINE)),
     MessageMapping(model.Progress, journal_pb2.Progress, "name", "done", "of", time_ns=_time(), left_s="remaining"),
     _NOTE,
-    _SETTINGS,
+    _SWEPT,
+    SETTINGS,
     MessageMapping(
         model.InstrumentReadings,
         instruments_pb2.InstrumentReadings,

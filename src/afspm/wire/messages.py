@@ -38,6 +38,7 @@ from afspm.wire.generated import (
     instruments_pb2,
     journal_pb2,
     lines_pb2,
+    loans_pb2,
     panel_pb2,
     scan_pb2,
     spectroscopy_pb2,
@@ -335,10 +336,11 @@ TIP_VERDICT: Final = MessageDeclaration(
 WATCH_COUNTS: Final = MessageDeclaration(
     type=WatchCounts, kind=MessageKind.RESULT, source=Role.COMPONENT, always=False, named=True
 )
+LENT_SETTINGS: Final = MessageDeclaration(type=loans_pb2.LentSettings)
 
 _MODULES = (
     analysis_pb2, channels_pb2, control_pb2, drift_pb2, feedback_pb2, geometry_pb2, grants_pb2, instruments_pb2,
-    journal_pb2, lines_pb2, panel_pb2, scan_pb2, spectroscopy_pb2,
+    journal_pb2, lines_pb2, loans_pb2, panel_pb2, scan_pb2, spectroscopy_pb2,
 )  # fmt: skip
 # collected by their class, so that no declaration above can be forgotten
 _declared: dict[str, MessageDeclaration] = {

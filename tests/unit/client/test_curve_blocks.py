@@ -36,7 +36,7 @@ class CurveLab(Lab):
 
 
 def two_curves(scope: Scope) -> None:
-    with scope.curves(SETTINGS, kind="IV", key="curve"):
+    with scope.curves(SETTINGS, kind="IV"):
         for number in (1, 2):
             scope.spectrum((number * 1e-7, 0.0), kind="IV", key=f"curve-{number}")
 
@@ -103,7 +103,7 @@ def test_wrong_request_sends_nothing() -> None:
 def test_block_and_sweep_with_one_key_are_both_set_back(tmp_path: Path) -> None:
     lab = CurveLab()
     scope = scope_of(lab, tmp_path)
-    with scope.curves(SETTINGS, key="a"), scope.sweep({"x-spec-to": ["0.6 V"]}, measure="spectrum", key="a") as points:
+    with scope.curves(SETTINGS), scope.sweep({"x-spec-to": ["0.6 V"]}, measure="spectrum", key="a") as points:
         list(points)
     assert lab.measured == [("-0.5", "0.6", "201")]
     assert lab.in_force == BEFORE
@@ -127,9 +127,9 @@ def test_block_in_a_sweep_is_refused() -> None:
     assert not lab.measured
 
 
-def test_control_is_kept_over_a_block() -> None:
+# physics P1, settings S4
+def test_others_may_measure_between_two_curves_of_a_block() -> None:
     lab = CurveLab()
     with (scope := scope_of(lab)).curves(SETTINGS):
         scope.spectrum((1e-7, 0.0))
-        assert lab.control.holder == lab.name
-    assert lab.control.holder is None
+        assert lab.control.holder is None

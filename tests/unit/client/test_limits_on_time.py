@@ -80,10 +80,10 @@ def test_sweep_waits_for_a_rate_and_sets_back() -> None:
     assert bench.is_done
     assert len(bench.scans) == 3
     sets = [one for one in entries(bench) if one.subject == names.TIP_BIAS_VOLTAGE and one.response == 0]
-    # 400 s for each step of 0.4 V, and 800 s for the way back to the simulator's 0.1 V
-    assert [float(one.value) for one in sets] == [0.1, 0.5, 0.9, 0.1]
-    gaps_s = [gap / 1e9 for gap in gaps_ns([one.sent_ns or 0 for one in sets])]
-    assert all(needed <= gap < needed + 30.0 for needed, gap in zip((400.0, 400.0, 800.0), gaps_s, strict=True))
+    # the first is in force; 400 s for each step of 0.4 V, and 800 s for the way back to the simulator's 0.1 V
+    assert [float(one.value) for one in sets] == [0.5, 0.9, 0.1]
+    gaps_s = [gap / 1e9 for gap in gaps_ns([one.time_ns for one in sets])]
+    assert all(needed <= gap < needed + 30.0 for needed, gap in zip((400.0, 800.0), gaps_s, strict=True))
 
 
 def test_grid_of_spectra_waits_between_its_spectra() -> None:

@@ -18,11 +18,14 @@ from afspm.components.planned_scans import ScanList, ScanSeries
 from afspm.components.spectroscopy_grid import SpectroscopyGrid
 from afspm.components.tip_verdict import BAD, GOOD, MESSAGE, LineVerdict, line_verdict_message, verdict_message
 from afspm.model import (
+    LEND_REQUEST,
     RELAY_REQUEST,
+    RETURN_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
     Note,
+    Parameter,
     Problem,
     Progress,
     Region,
@@ -240,14 +243,14 @@ def test_list_is_scanned_in_order_round_after_round() -> None:
     assert [region.center_m[0] for region in lab.finished] == [1e-6, 2e-6, 1e-6, 2e-6]
 
 
-def test_parameters_are_set_before_the_first_scan() -> None:
+def test_each_scan_carries_the_parameters_of_its_plan() -> None:
     lab = Lab("series")
-    plan = ScanSeries(size=(1e-6, 1e-6), pixels=(8, 8), scans=1, parameters={"tip-bias-voltage": "250 mV"})
+    plan = ScanSeries(size=(1e-6, 1e-6), pixels=(8, 8), scans=2, parameters={"tip-bias-voltage": "250 mV"})
     run(plan, lab)
-    (asked,) = (request.subject for request in lab.requests if request.kind == ControlRequest.PARAM)
-    assert (asked.name, float(asked.value), asked.unit) == ("tip-bias-voltage", 250.0, "mV")
-    kinds = [request.kind for request in lab.requests]
-    assert kinds.index(ControlRequest.PARAM) < kinds.index(ControlRequest.ACTION)
+    wanted = Parameter("tip-bias-voltage", "250.0", "mV")
+    assert [one.subject.parameters for one in lab.requests if one.kind == LEND_REQUEST] == [(wanted,)] * 2
+    kinds = [one.kind for one in lab.requests if one.kind in (LEND_REQUEST, ControlRequest.ACTION, RETURN_REQUEST)]
+    assert kinds[:5] == [*2 * [LEND_REQUEST, ControlRequest.ACTION], RETURN_REQUEST]
 
 
 def test_a_spectrum_is_taken_at_each_point_of_a_grid() -> None:

@@ -15,7 +15,7 @@ from tests.unit.components.survey_lab import PARTICLES, ParticleLab
 from afspm.basics.errors import ConfigError
 from afspm.basics.exit_codes import ExitCode
 from afspm.components.survey import Survey
-from afspm.model import ControlRequest, Problem, Scan
+from afspm.model import LEND_REQUEST, ControlRequest, Problem, Scan
 
 pytest.importorskip("skimage")
 CURVES: Any = {"top": 0.0, "beside": 200e-9, "left": (-100e-9, 0.0)}
@@ -89,14 +89,14 @@ def test_survey_without_targets_logs_that_and_ends(ran: Any, caplog: pytest.LogC
     assert "no target found" in caplog.text
 
 
-def test_parameters_are_set_before_the_survey_and_others_before_the_zooms(ran: Any) -> None:
+def test_survey_carries_its_settings_and_the_zooms_theirs(ran: Any) -> None:
     lab = ParticleLab()
     bias = "tip-bias-voltage"
     ran(lab, survey(parameters={bias: "1 V"}, zoom_parameters={bias: "2 V"}, count=1, curves={}))
     done = [
-        request.subject.value if request.kind == ControlRequest.PARAM else request.subject
+        request.subject.parameters[0].value if request.kind == LEND_REQUEST else request.subject
         for request in lab.requests
-        if request.kind in (ControlRequest.PARAM, ControlRequest.ACTION)
+        if request.kind in (LEND_REQUEST, ControlRequest.ACTION)
     ]
     assert done == ["1.0", "start-scan", "2.0", "start-scan"]
 

@@ -121,7 +121,7 @@ class Adaptive(Component):
 
     def run(self) -> None:
         kept = self.scope.control() if self.keep_control else nullcontext()
-        with kept, self.scope.curves(self.curve, kind=self.kind, key="curve"):
+        with kept, self.scope.curves(self.curve, kind=self.kind):
             self._measure()
         if self.end_when_done:
             self.scope.end_experiment()

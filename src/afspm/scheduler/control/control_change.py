@@ -116,6 +116,11 @@ def _carry_out(draft: StateDraft, change: _Change) -> None:
     entries = control_entries(draft.now_ns, before, after, change.ask, change.row, problems)
     draft.event_log = draft.event_log.add(draft.now_s, *entries)
     draft.lease = draft.lease.held_by(after.holder, draft.now_ns)
+    if before.holder != after.holder:
+        draft.loans = draft.loans.nothing_stated()
+        if after.solving:  # a repair, and what judges it, takes place at the base
+            others = [key for key, loan in draft.loans.loans.items() if loan.lender != after.holder]
+            draft.loans = draft.loans.ended(others)
     if before.mode is not after.mode:
         draft.others_may_have_acted(by="" if after.mode is ControlMode.MANUAL else change.ask.who)
     if draft.panel.why and after.mode is not ControlMode.MANUAL:  # a person has let the run continue

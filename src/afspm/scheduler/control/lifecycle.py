@@ -106,8 +106,9 @@ class ExperimentEnd:
         """Return the state with an answer kept until the experiment has ended; None if no end is in progress."""
         return None if self.by_s is None else replace(self, kept=(*self.kept, answer))
 
-    def is_due(self, now_s: float, *, owes_retract: bool) -> bool:
-        return self.by_s is not None and not (owes_retract and now_s < self.by_s)
+    def is_due(self, now_s: float, *, waits: bool) -> bool:
+        """Return whether the experiment ends now; it waits for a tip in danger, and for settings on their way back."""
+        return self.by_s is not None and not (waits and now_s < self.by_s)
 
     def ended(self, now_s: float) -> ExperimentEnd:
         """Begin the grace period."""

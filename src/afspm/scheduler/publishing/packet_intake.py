@@ -132,6 +132,7 @@ def _give_to_person(draft: StateDraft, why: str) -> None:
 def _update_scope_state(draft: StateDraft, state: ScopeState) -> None:
     before = draft.microscope
     draft.microscope = before.with_state(state, draft.now_s)
+    draft.loans = draft.loans.in_state(is_free=state is ScopeState.FREE, now_ns=draft.now_ns)
     if state is ScopeState.FREE:
         draft.limits = draft.limits.with_movers(MoverState.free)
     elif state is ScopeState.INTERRUPTED:

@@ -44,6 +44,29 @@ class MoveForTurn:
 
 
 @dataclass(frozen=True, slots=True)
+class CompareForTurn:
+    """The purpose of comparing the values in force before the request `number` is decided."""
+
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class SetForTurn:
+    """The purpose of a step on the way of a loan before the request `number` is decided.
+
+    Attributes:
+        key: the key of the loan.
+        is_back: whether it is on the way back.
+        ends_loan: whether the base is in force again after it.
+    """
+
+    number: int
+    key: str
+    is_back: bool
+    ends_loan: bool
+
+
+@dataclass(frozen=True, slots=True)
 class ReadAhead:
     """The purpose of reading `name` when a translator connects."""
 
@@ -57,7 +80,7 @@ class AskForFrame:
     purpose: object
 
 
-OwnPurpose = ReadForTurn | ReadForOrder | MoveForTurn | ReadAhead | AskForFrame
+OwnPurpose = ReadForTurn | ReadForOrder | MoveForTurn | CompareForTurn | SetForTurn | ReadAhead | AskForFrame
 
 
 class ForwardedRequest(NamedTuple):
@@ -79,6 +102,7 @@ class ForwardedRequest(NamedTuple):
         sent_ns: for a client's request, the experiment time of the first sending; None before. Never set for the
             scheduler's own requests.
         is_repeated: whether the request was sent before under its id, with an unknown outcome.
+        is_by_hand: whether it was sent in MANUAL, and so by a person.
         purpose: the purpose of a request of the scheduler itself; None: the tip's safety, or a client's request.
     """
 
@@ -95,6 +119,7 @@ class ForwardedRequest(NamedTuple):
     heard_s: float = 0.0
     sent_ns: int | None = None
     is_repeated: bool = False
+    is_by_hand: bool = False
     purpose: OwnPurpose | None = None
 
     @classmethod
@@ -244,6 +269,13 @@ class Forwarder:
         """Remove a waiting request."""
         own, queue = (tuple(job for job in jobs if job.number != number) for jobs in (self.own, self.queue))
         return replace(self, own=own, queue=queue)
+
+    def waiting_longer(self, number: int, by_s: float) -> Forwarder:
+        """Return the queue with a later deadline for a client's waiting request."""
+        queue = tuple(
+            job._replace(deadline_s=job.deadline_s + by_s) if job.number == number else job for job in self.queue
+        )
+        return replace(self, queue=queue)
 
     def waiting(self, number: int) -> ForwardedRequest | None:
         """Return a client's waiting request by its number; None: it was sent, answered or removed."""

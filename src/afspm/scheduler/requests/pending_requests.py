@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from afspm.basics.frozen import replace
-from afspm.model import Parameter, ScopeState, ScopeStatus
+from afspm.model import Parameter, Response, ScopeState, ScopeStatus, Setting
 from afspm.model.microscope_status import MicroscopeStatus
 from afspm.scheduler.events import RequestIn
 from afspm.scheduler.requests.forwarder import ForwardedRequest
@@ -50,20 +50,68 @@ class PrePositioner:
 
 
 @dataclass(frozen=True)
+class WayStep:
+    """A setting on the way of a loan.
+
+    Attributes:
+        key: the key of the loan.
+        target: the last value of the way, which may need several steps.
+        lender: the component that lends it; empty on the way back.
+    """
+
+    key: str
+    target: Parameter
+    lender: str = ""
+
+
+@dataclass(frozen=True)
+class Lending:
+    """The settings before a measurement: what was read, what is still to be sent, and the wait after it.
+
+    Attributes:
+        compared: the translator's answers by name.
+        now: the values in force by name.
+        way: what is still to be set, in order; None: the values in force are being read.
+        kind: the present kind of curve; empty: the microscope shows none.
+        kind_before: the kind to be set back at the end; empty: none.
+        sent: the value on its way to the microscope.
+        has_set: whether a value was set: a way back that gives way to other requests takes one step at least.
+        changes_loop: whether something was changed after which the feedback settles.
+        settles_ns: the experiment time until which it settles; None: no wait.
+        later: the refusal of a return by a limit on time; None: none.
+        is_done: whether the settings are as the measurement states them.
+    """
+
+    compared: Mapping[str, Setting] = field(default_factory=dict)
+    now: Mapping[str, Parameter] = field(default_factory=dict)
+    way: tuple[WayStep, ...] | None = None
+    kind: str = ""
+    kind_before: str = ""
+    sent: Parameter | None = None
+    has_set: bool = False
+    changes_loop: bool = False
+    settles_ns: int | None = None
+    later: Response | None = None
+    is_done: bool = False
+
+
+@dataclass(frozen=True)
 class Turn:
-    """The reads and the move before one request is sent.
+    """The settings, the reads and the move before one request is sent.
 
     Attributes:
         number: the number of the request in the forwarder's queue.
         awaited: parameters being read; None: reading has not begun.
         values: the read values, by parameter; None where the microscope answered without a value.
         move: the move before an action; None: no move so far.
+        lending: the settings of a measurement; None: they were not looked at.
     """
 
     number: int
     awaited: frozenset[str] | None = None
     values: Mapping[str, Parameter | None] = field(default_factory=dict)
     move: PrePositioner | None = None
+    lending: Lending | None = None
 
     def reading(self, names: frozenset[str]) -> Turn:
         return replace(self, awaited=names, values={})
@@ -78,11 +126,14 @@ class Turn:
 
     def moving(self, move: PrePositioner) -> Turn:
         """Register a move to wait for, after which the values are read again."""
-        return Turn(self.number, move=move)
+        return Turn(self.number, move=move, lending=self.lending)
 
-    def is_ready(self, microscope: MicroscopeStatus, now_s: float) -> bool:
+    def is_ready(self, microscope: MicroscopeStatus, now_s: float, now_ns: int) -> bool:
         """Return whether the request can be decided now."""
-        return not self.awaited and (self.move is None or self.move.is_ready(microscope, now_s))
+        settles_ns = None if self.lending is None else self.lending.settles_ns
+        if self.awaited or (settles_ns is not None and now_ns < settles_ns):
+            return False
+        return self.move is None or self.move.is_ready(microscope, now_s)
 
 
 @dataclass(frozen=True)
@@ -102,6 +153,11 @@ class PendingRequests:
     @property
     def move(self) -> PrePositioner | None:
         return None if self.turn is None else self.turn.move
+
+    @property
+    def settles_ns(self) -> int | None:
+        """The experiment time until which a change of settings settles; None: no wait."""
+        return None if self.turn is None or self.turn.lending is None else self.turn.lending.settles_ns
 
     def with_unclear(self, event: RequestIn, now_s: float) -> PendingRequests:
         return replace(self, unclear={**self.unclear, event.name: (event, now_s + _UNCLEAR_S)})

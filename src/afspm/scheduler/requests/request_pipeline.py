@@ -28,11 +28,13 @@ from afspm.basics.errors import InvalidValue
 from afspm.basics.frozen import replace
 from afspm.model import (
     CLOCK_REQUEST,
+    COMPARE_REQUEST,
     GRANT_REQUEST,
     HAS_ENDED,
     LEASE_REQUEST,
     RELAY_REQUEST,
     RESTART_REQUEST,
+    RETURN_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
@@ -41,6 +43,7 @@ from afspm.model import (
     Request,
     Response,
     ResponseDetail,
+    Settings,
     component_of,
     names,
 )
@@ -54,9 +57,10 @@ from afspm.scheduler.coordinate_frame import MappedRequest
 from afspm.scheduler.events import FrameAnswered, Reply, RequestIn
 from afspm.scheduler.publishing import own_packets as publishing
 from afspm.scheduler.publishing.event_log import SCHEDULER
-from afspm.scheduler.requests import answers, approvals, instrument_requests
+from afspm.scheduler.requests import answers, approvals, instrument_requests, lending
 from afspm.scheduler.requests.forwarder import (
     AskForFrame,
+    CompareForTurn,
     ForwardedRequest,
     ForwardOutcome,
     MoveForTurn,
@@ -64,6 +68,7 @@ from afspm.scheduler.requests.forwarder import (
     ReadAhead,
     ReadForOrder,
     ReadForTurn,
+    SetForTurn,
     SettledRequest,
 )
 from afspm.scheduler.requests.pending_requests import PrePositioner, Turn
@@ -72,6 +77,7 @@ from afspm.scheduler.safety.forbidden_states import STARTED
 from afspm.scheduler.safety.limit_checker import is_get
 from afspm.scheduler.safety.movers import MoverState
 from afspm.scheduler.state import StateDraft
+from afspm.wire.messages import LENT_SETTINGS
 
 _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
 _ANOTHER_RUN = "this is the scheduler of another run: two experiments have the same address"
@@ -117,15 +123,17 @@ def _take_word(draft: StateDraft, event: RequestIn) -> None:
 
 def _by_canonical_name(draft: StateDraft, event: RequestIn) -> tuple[RequestIn, str]:
     # before all stages, so that no limit, rule or approval is passed under another name; also why it can't be
-    asked = event.request.subject
-    if not isinstance(asked, Parameter) or asked.name != names.BIAS_OF_SAMPLE:
+    asked, alias = event.request.subject, names.BIAS_OF_SAMPLE
+    parameters = asked.parameters if isinstance(asked, Settings) else (asked,) if isinstance(asked, Parameter) else ()
+    if all(one.name != alias for one in parameters):
         return event, ""
     try:
-        subject = draft.env.settings.limits.bias.canonical(asked)
+        renamed = tuple(map(draft.env.settings.limits.bias.canonical, parameters))
     except InvalidValue as error:
         return event, error.what
+    subject = Settings.of(*renamed, settle_s=asked.settle_s) if isinstance(asked, Settings) else renamed[0]
     payload = draft.env.codec.encode(subject)
-    return replace(event, request=replace(event.request, subject=subject, payload=payload, alias=asked.name)), ""
+    return replace(event, request=replace(event.request, subject=subject, payload=payload, alias=alias)), ""
 
 
 # --- 1. admitted: the name belongs to the peer, and the request is new -----------------------------------------------
@@ -223,7 +231,9 @@ def authorise(draft: StateDraft, event: RequestIn) -> bool:
         _renew_lease(draft, event)
     elif kind == GRANT_REQUEST:
         approvals.decide(draft, event)
-    elif kind <= 0:
+    elif kind == RETURN_REQUEST:
+        return _take_return(draft, event)
+    elif kind <= 0 or kind == COMPARE_REQUEST:
         why = f"there is no request with the number {kind}"
         answers.answer(draft, event, ControlResponse.CMD_NOT_SUPPORTED, why)
     elif remedy := _refusal_to_continue(draft, event):
@@ -273,6 +283,14 @@ def _renew_lease(draft: StateDraft, event: RequestIn) -> None:
     draft.lease = draft.lease.asked(event.request.subject, draft.now_s)
     response = Response(int(ControlResponse.SUCCESS), b"", "", event.request.id)
     draft.effects.append(Reply(event.connection, name, response, LEASE_REQUEST))
+
+
+def _take_return(draft: StateDraft, event: RequestIn) -> bool:
+    draft.loans = draft.loans.returned_by(event.name, [one.name for one in event.request.subject.parameters])
+    if lending.is_to_return(draft.loans) and lending.may_return(draft):
+        return True  # answered once they are set back
+    answers.answer(draft, event, ControlResponse.SUCCESS)
+    return False
 
 
 def _answer_clock_request(draft: StateDraft, event: RequestIn) -> None:
@@ -352,9 +370,15 @@ def send_own(draft: StateDraft) -> None:
 
 def _next_job(draft: StateDraft) -> ForwardedRequest | None:
     queue, turn = draft.forwarder.queue, draft.pending.turn
+    # no command waits for settings to be set back, unless it measures with them: that is its own turn
+    others = [job for job in queue if job.request.kind != RETURN_REQUEST]
+    if turn is not None and any(job.command for job in others):
+        of_turn, has_set = draft.forwarder.waiting(turn.number), turn.lending is not None and turn.lending.has_set
+        if of_turn is not None and of_turn.request.kind == RETURN_REQUEST and has_set:
+            draft.pending, turn = replace(draft.pending, turn=None), None
     if turn is None:
-        return queue[0] if queue else None
-    if turn.is_ready(draft.microscope, draft.now_s):
+        return next(iter([*others, *queue]), None)
+    if turn.is_ready(draft.microscope, draft.now_s, draft.now_ns):
         return draft.forwarder.waiting(turn.number)
     # reads change nothing, so they need not wait for the turn of a command
     return next((job for job in queue if not job.command), None)
@@ -365,8 +389,8 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
         if not isinstance(mapped := _mapped(draft, job), Response):
             _send(draft, job, mapped)
         return
-    # authorised again: control may have changed while the command waited
-    if (refusal := _not_allowed_now(draft, job)) is not None:
+    # authorised again: control may have changed while the command waited; who has lent may return without control
+    if job.request.kind != RETURN_REQUEST and (refusal := _not_allowed_now(draft, job)) is not None:
         _answer_unsent(draft, job, refusal)
         return
     if _knows_no_danger(draft, job):
@@ -374,7 +398,17 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
         # the death of its earlier life is decided now: the tip is retracted, and this command is called back
         control_change.decide(draft, ControlInput(ArbitrationEvent.DEAD, job.client))
         return
+    if lending.has_forgotten(draft, job):
+        why = "what was stated for this measurement is not known any more: state it again"
+        refusal = Response(int(ControlResponse.NOT_FREE), b"", why, job.request.id, ResponseDetail.STATE_AGAIN)
+        _answer_unsent(draft, job, refusal)
+        return
     turn = draft.pending.turn or Turn(job.number)
+    if lending.takes_turn(draft, job) if turn.lending is None else not turn.lending.is_done:
+        advanced = lending.advance(draft, job, turn)
+        if advanced is None:
+            return
+        turn = advanced
     if turn.awaited is None and _starts_reads(draft, job, turn):
         return
     _apply_read_values(draft, turn)
@@ -403,7 +437,8 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
 def _send(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None) -> None:
     name, request = job.client, job.request
     sent_ns = draft.event_log.sent_ns(name, request, draft.now_ns)
-    job = job._replace(mapped=mapped, states_seen=draft.microscope.states_seen, sent_ns=sent_ns)
+    is_by_hand = draft.control.mode is ControlMode.MANUAL
+    job = job._replace(mapped=mapped, states_seen=draft.microscope.states_seen, sent_ns=sent_ns, is_by_hand=is_by_hand)
     draft.event_log = draft.event_log.sending(name, request, sent_ns)
     if job.command:
         draft.pending = replace(draft.pending, turn=None)
@@ -541,6 +576,22 @@ def _refusal_for_second_electrode(job: ForwardedRequest, turn: Turn) -> Response
         f"{names.SAMPLE_BIAS} reads {volts}: set it to 0 V, or set {names.TIP_BIAS_VOLTAGE}"
     )
     return Response(int(ControlResponse.PARAM_ERROR), b"", why, job.request.id)
+
+
+def _take_compared(draft: StateDraft, number: int, response: Response) -> None:
+    turn, job = draft.pending.turn, draft.forwarder.waiting(number)
+    if turn is None or job is None or turn.number != number or turn.lending is None:
+        return
+    found = draft.env.codec.decode_packet(LENT_SETTINGS.name, response.payload) if response.ok else None
+    if isinstance(found, Settings):
+        lending.take_compared(draft, turn, found)
+    elif response.code == ControlResponse.NO_RESPONSE:
+        _answer_unsent(draft, job, _failed_before(response))
+    elif response.code == ControlResponse.CMD_NOT_SUPPORTED:  # a translator of another make: the values are read
+        draft.loans = replace(draft.loans, is_compared=False)
+        draft.pending = replace(draft.pending, turn=Turn(number))
+    else:
+        _answer_unsent(draft, job, response)
 
 
 def _take_read_value(draft: StateDraft, number: int, name: str, response: Response) -> None:
@@ -686,6 +737,11 @@ def _serve_purpose(draft: StateDraft, purpose: OwnPurpose, response: Response) -
             _take_read_value(draft, purpose.number, purpose.name, response)
         case ReadForOrder():
             instrument_requests.take_read_value(draft, purpose, response, _not_allowed_now)
+        case CompareForTurn():
+            _take_compared(draft, purpose.number, response)
+        case SetForTurn():
+            answered = draft.env.codec.decode_parameter(response.payload) if response.payload else None
+            lending.take_set(draft, purpose, answered, response)
         case MoveForTurn():
             _take_move_result(draft, purpose.number, response)
         case AskForFrame():
@@ -739,13 +795,17 @@ def _apply_success(draft: StateDraft, job: ForwardedRequest, response: Response)
     if job.command:
         _restart_lease(draft, job.client)
         approvals.done(draft, job)
-        if draft.control.mode is ControlMode.MANUAL:
+        if job.client:
+            draft.loans = draft.loans.decided(draft.limits.names_set_by(job.outgoing), draft.limits.kind_of_curve)
+        if job.is_by_hand and draft.control.mode is ControlMode.MANUAL:
             draft.by_hand = draft.by_hand.requested(request)
     return response
 
 
 def _action_started(draft: StateDraft, job: ForwardedRequest, *, is_certain: bool) -> None:
     action = str(job.request.subject)
+    if action in lending.MEASURES:
+        draft.loans = draft.loans.nothing_stated()
     draft.watchdog = draft.watchdog.started(action, job.states_seen, draft.microscope)
     if (state := STARTED.get(action)) is not None:
         until_s = draft.now_s + draft.env.settings.control.request_timeout_s
@@ -774,4 +834,6 @@ def _unknown_status(response: Response) -> RequestStatus | None:
 
 def reads(request: Request) -> bool:
     """Return whether a request is read-only."""
-    return request.kind == ControlRequest.ACTION_SUPPORT or (request.kind == _PARAM and is_get(request))
+    if request.kind in (ControlRequest.ACTION_SUPPORT, COMPARE_REQUEST):
+        return True
+    return request.kind == _PARAM and is_get(request)

@@ -167,7 +167,7 @@ class LimitChecker:
 
     def _with_sweep(self, request: Request) -> ExperimentLimits:
         # a curve that sweeps the bias sets it to both ends; where they are not shown, the bias in force counts
-        kind, ends = self._kind_of_curve(), [self.state.usage.known.get(name) for name in names.SPEC_ENDS]
+        kind, ends = self.kind_of_curve, [self.state.usage.known.get(name) for name in names.SPEC_ENDS]
         if not self._is_curve(request) or kind not in names.SWEEPS_BIAS or None in ends:
             return self.limits
         swept = tuple(Parameter(names.TIP_BIAS_VOLTAGE, repr(end.value), "V") for end in ends if end is not None)
@@ -177,13 +177,15 @@ class LimitChecker:
     def _is_curve(request: Request) -> bool:
         return request.kind == ControlRequest.ACTION and request.subject == names.START_SPEC
 
-    def _kind_of_curve(self) -> str:
+    @property
+    def kind_of_curve(self) -> str:
+        """The present kind of curve, as last read; empty if unknown."""
         reported = self.state.last_seen.get(names.SPEC_KIND)
         return (reported and reported.value) or ""
 
     def outside(self, changed: Parameter) -> str:
         """Return why a value that a person has set lies outside its range or in a forbidden state; empty: neither."""
-        limit, value = self.limits.parameters.get(changed.name), self._number(changed)
+        limit, value = self.limits.parameters.get(changed.name), self.number(changed)
         if limit is not None and value is not None:
             try:
                 self._check_range(changed.name, value, limit, _TOLD_REACH)
@@ -253,7 +255,7 @@ class LimitChecker:
         Args:
             values: None where the microscope answered without a value. A parameter that it does not have is left out.
         """
-        numbers_read = {name: None if reported is None else self._number(reported) for name, reported in values.items()}
+        numbers_read = {name: None if reported is None else self.number(reported) for name, reported in values.items()}
         usage = self.state.usage
         for name in _OF_CURVES - values.keys() - self.limits.bounded:  # not shown any more
             usage = usage.forget(name)
@@ -458,6 +460,17 @@ class LimitChecker:
             uses.append(str(request.subject))
         return [name for name in uses if name in counted]
 
+    def next_step(self, now: Parameter, wanted: Parameter) -> Parameter:
+        """Return the farthest value on the way from one value to another that the largest step allows."""
+        limit = self.limits.parameters.get(wanted.name)
+        start, end = self.number(now), self.number(wanted)
+        if limit is None or limit.step is None or start is None or end is None:
+            return wanted
+        count = math.ceil(abs(end - start) / limit.step * (1 - _REACH))
+        if count <= 1:
+            return wanted
+        return Parameter(wanted.name, f"{start + (end - start) / count:.12g}", limit.unit or wanted.unit)
+
     def names_set_by(self, request: Request) -> list[str]:
         """Return the parameters that a request sets. Malformed values have no name: `check` refuses such a request."""
         values = [value for subject in self._set_by(request) for value in self._valid_values(subject)]
@@ -469,7 +482,8 @@ class LimitChecker:
         except ParameterValueError:
             return []
 
-    def _number(self, reported: Parameter) -> float | None:
+    def number(self, reported: Parameter) -> float | None:
+        """Return a value in the unit of its limit, or in SI; None for a text or without a value."""
         limits = self.limits.parameters
         if reported.name in _READ_FOR_ACTIONS and reported.name not in limits:
             # in SI, for the ranges of roles and grants
@@ -567,7 +581,7 @@ class LimitChecker:
         return [names.SPEC_KIND, *sorted(needed)] if needed else []
 
     def _check_curve(self) -> None:
-        kind = self._kind_of_curve() or "of no known kind"
+        kind = self.kind_of_curve or "of no known kind"
         sweeps_bias, sweeps_height = kind not in names.SWEEPS_HEIGHT, kind not in names.SWEEPS_BIAS
         mine = (_OF_BIAS_CURVES if sweeps_bias else frozenset()) | (_OF_HEIGHT_CURVES if sweeps_height else frozenset())
         for name in sorted(mine):
