@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+import math
+from contextlib import nullcontext, suppress
 from typing import Any, ClassVar
 
-from afspm.basics import ControlLost, RequestError
+from afspm.basics import ControlLost
 from afspm.basics.errors import ConfigError, InvalidValue, Refused
 from afspm.components.feedback_metrics import FeedbackError, FeedbackQuality, gain_search
 from afspm.components.feedback_signal import FeedbackObserver
-from afspm.model import Parameter, Problem, names
+from afspm.model import ControlResponse, Parameter, Problem, names
 
-# interval of attempts to restore the gain, while a person or another component holds control
+# interval of attempts to set a good gain, while a person or another component holds control
 BACK_WITHIN_S = 60.0
+_ROUNDED = 1e-6  # relative: a gain on the wire is in single precision
 
 
 class FeedbackTuner(FeedbackObserver):
@@ -21,10 +23,10 @@ class FeedbackTuner(FeedbackObserver):
     The component raises the gain while the feedback is too slow, and lowers the gain while the feedback oscillates. If
     no gain is good, the component restores the original gain, says so at CRITICAL, and clears the flag, so that the
     experiment continues as before. The same happens if the signal stays at one distance from the setpoint while the
-    height follows: then the setpoint and the channel are calibrated differently, which no gain changes. After a failed
-    scan, a loss of control or a kill, it sets the last good gain of the search, or the original gain if none was good.
-    If that gain is refused, the component flags `device-malfunction`, so that nothing is scanned until a person has set
-    a gain.
+    height follows: then the setpoint and the channel are calibrated differently, which no gain changes. Each test scan
+    carries its gain, so that the original one is set back after a failed scan, a loss of control or a kill; a good gain
+    of the search is set as soon as possible. If a gain can't be set again, the component flags `device-malfunction`, so
+    that nothing is scanned until a person has set one.
 
     `afspm check` compares the bounds with those of the microscope and of `[limits]`, so that no gain beyond is set.
 
@@ -54,11 +56,14 @@ class FeedbackTuner(FeedbackObserver):
         bounds = {"lowest_gain": lowest_gain, "highest_gain": highest_gain}
         self.planned_parameters = {name: (Parameter(names.ZCTRL_IGAIN, str(gain)),) for name, gain in bounds.items()}
         self._slow: FeedbackError | None = None  # of the gain before, if that was too low
+        self._way: list[float] = []  # the gains of a search, in order
 
     def run(self) -> None:
         while True:
-            self._leave_behind()
-            if not self.scope.wait_until(self._is_wanted, timeout_s=BACK_WITHIN_S if "gain" in self.memory else None):
+            # control was lost, or this process was killed, after a good gain was found
+            with suppress(ControlLost), self.scope.control(timeout_s=BACK_WITHIN_S) if self._found else nullcontext():
+                self._set_found()
+            if not self.scope.wait_until(self._is_wanted, timeout_s=BACK_WITHIN_S if self._found else None):
                 continue
             try:
                 # a scan that is repeated after a person has had the microscope is none of the gain that was tried
@@ -66,6 +71,11 @@ class FeedbackTuner(FeedbackObserver):
                     self._tune()
             except ControlLost as lost:
                 self.log.info("the search is over: %s", lost.what)
+
+    @property
+    def _found(self) -> float | None:
+        found: float | None = self.memory.get("gain")
+        return found
 
     def _is_wanted(self) -> bool:
         scope = self.scope
@@ -76,24 +86,25 @@ class FeedbackTuner(FeedbackObserver):
         if feedback is None or feedback.integral_gain is None or feedback.on is False:
             self._finish(f"the feedback in force is {feedback}")
             return
-        self.memory.setdefault("gain", feedback.integral_gain)
-        self.memory["way"] = [feedback.integral_gain]
-        self.memory.save()
+        before, self._way = feedback.integral_gain, [feedback.integral_gain]
+        self.memory["before"] = before
+        start, why = min(max(before, self.lowest), self.highest), ""
         try:
-            found = self._search(min(max(feedback.integral_gain, self.lowest), self.highest))
+            # each scan has a gain of its own; the scheduler sets the former one back
+            with self.scope.settings({names.ZCTRL_IGAIN: start}):
+                if self._search(start) is None:
+                    why = f"no gain is good from {self.lowest:g} to {self.highest:g}"
+                elif not self._set_found():
+                    return
         except InvalidValue as error:
-            self._finish(error.what)
+            why = error.what
+        if why and not math.isclose(gain := self._in_force(), before, rel_tol=_ROUNDED):
+            self._call_a_person(before, gain, "the log of the scheduler says why")
             return
-        except ControlLost:
-            raise
-        except RequestError:  # the scans may fail because of this gain, and the tip must not stay with it
-            with suppress(RequestError):
-                self._set_back(BACK_WITHIN_S)
-            raise
-        if found is not None:
-            self._keep(found)
-        none = f"no gain is good from {self.lowest:g} to {self.highest:g}"
-        self._finish("" if found is not None else none)
+        self._finish(why)
+
+    def _in_force(self) -> float:
+        return float(self.scope.get(names.ZCTRL_IGAIN))
 
     def _search(self, start: float) -> float | None:
         # a good gain is saved at once: a kill afterwards must not lose it
@@ -107,18 +118,19 @@ class FeedbackTuner(FeedbackObserver):
                 gain = search.send(following)
         except StopIteration as done:
             found: float | None = done.value
+        if found is not None:
+            self._keep(found)
         return found
 
     def _try(self, gain: float) -> FeedbackQuality | None:
         try:
-            self.scope.set_feedback(integral_gain=gain)
+            scans = self.scope.scan(settings={names.ZCTRL_IGAIN: gain})
         except Refused as refused:
+            if refused.response == ControlResponse.ACTION_ERROR:  # not the gain, but the scan
+                raise
             self.log.warning("integral gain %g was refused: %s", gain, refused.reason)
             return None
-        self.memory["way"] = [*self.memory["way"], gain]
-        self.memory["in_force"] = self.scope.feedback and self.scope.feedback.integral_gain
-        self.memory.save()
-        scans = self.scope.scan()
+        self._way.append(gain)
         held = self.held_channel()
         for name in (held, self.height):
             if name and name not in scans:
@@ -140,54 +152,41 @@ class FeedbackTuner(FeedbackObserver):
         self.memory.save()
 
     def _finish(self, why: str) -> None:
-        if not self._set_back():
-            return
         if why:
             self.log.critical("the feedback can't be improved: %s. Its setting is as before; please check it", why)
         self.scope.clear(Problem.FEEDBACK_NON_OPTIMAL)
 
-    def on_end(self) -> None:
-        gain, way = self.memory.get("gain"), self.memory.get("way")
-        if gain is not None and way and gain != way[-1]:
-            self.log.warning("it ends before the integral gain, now %g, is set back to %g", way[-1], gain)
-
-    def _leave_behind(self) -> None:
-        # control was lost before `_finish`, or this process was killed
-        if "gain" in self.memory:
-            with suppress(ControlLost), self.scope.control(timeout_s=BACK_WITHIN_S):
-                self._set_back()
-
-    def _set_back(self, timeout_s: float | None = None) -> bool:
-        gain = self.memory.get("gain")
+    def _set_found(self) -> bool:
+        # the gain that was found stays: it is no setting of a measurement
+        gain, before = self._found, self.memory.get("before")
         if gain is None:
             return True
-        now, own = self.scope.feedback and self.scope.feedback.integral_gain, self.memory.get("in_force")
+        known = [*self._way, *([] if before is None else [before]), gain]
         try:
-            if own is None or now is None or now == own:
-                self._go_back_to(gain, timeout_s)
+            if any(math.isclose(self._in_force(), one, rel_tol=_ROUNDED) for one in known):
+                self._go_to(gain)
+                self.log.info("integral gain %g", gain)
             else:
-                self.log.warning("integral gain %g stays: others have set it since", gain := now)
+                self.log.warning("integral gain %g stays: others have set it since", self._in_force())
         except Refused as refused:
-            text = "integral gain %g can't be set again: %s. The feedback in force is %s; set a gain by hand"
-            self.log.critical(text, gain, refused.reason, self.scope.feedback)
-            self.scope.flag(Problem.DEVICE_MALFUNCTION)
-            is_back = False
-        else:
-            self.log.info("integral gain %g", gain)
-            is_back = True
-        del self.memory["gain"]
-        self.memory.pop("way", None)
-        self.memory.pop("in_force", None)
-        self.memory.save()
-        return is_back
+            self._call_a_person(gain, self._in_force(), refused.reason)
+            return False
+        finally:
+            del self.memory["gain"]
+            self.memory.save()
+        return True
 
-    def _go_back_to(self, gain: float, timeout_s: float | None) -> None:
+    def _call_a_person(self, wanted: float, gain: float, why: str) -> None:
+        text = "integral gain %g can't be set again: %s. The gain in force is %g; set a gain by hand"
+        self.log.critical(text, wanted, why, gain)
+        self.scope.flag(Problem.DEVICE_MALFUNCTION)
+
+    def _go_to(self, gain: float) -> None:
         try:
-            self.scope.set_feedback(integral_gain=gain, timeout_s=timeout_s)
+            self.scope.set_feedback(integral_gain=gain)
         except Refused:
             # a limit on steps may refuse the whole way, and allow the steps of the search
-            way = self.memory.get("way", [])
-            if gain not in way[:-1]:
+            if gain not in self._way[:-1]:
                 raise
-            for one in reversed(way[way.index(gain) : -1]):
-                self.scope.set_feedback(integral_gain=one, timeout_s=timeout_s)
+            for one in reversed(self._way[self._way.index(gain) : -1]):
+                self.scope.set_feedback(integral_gain=one)

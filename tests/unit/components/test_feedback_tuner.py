@@ -15,6 +15,8 @@ from afspm.basics.errors import MeasurementFailed, Refused
 from afspm.basics.exit_codes import ExitCode
 from afspm.components.feedback_tuner import FeedbackTuner
 from afspm.model import (
+    LEND_REQUEST,
+    RETURN_REQUEST,
     ControlRequest,
     ControlResponse,
     Feedback,
@@ -34,21 +36,29 @@ HEIGHT = 1e-6 * np.random.default_rng(1).normal(size=(10, 10)).cumsum(axis=1)
 
 
 class Rig(Lab):
-    """A laboratory whose amplitude follows from the integral gain by `amplitude`."""
+    """A laboratory whose amplitude follows from the integral gain by `amplitude`; what is lent is set back."""
 
     def __init__(self, amplitude: Callable[[float], np.ndarray], setpoint: float = SETPOINT, on: bool = True) -> None:
         super().__init__("tuner")
         self.amplitude, self.setpoint, self.height = amplitude, setpoint, HEIGHT
-        self.values[names.ZCTRL_SETPOINT] = str(setpoint)
+        self.values |= {names.ZCTRL_SETPOINT: str(setpoint), names.ZCTRL_IGAIN: str(BEFORE)}
+        self.gains: list[float] = []
         self.publish(Feedback(on=on, integral_gain=BEFORE))
         self.flag(Problem.FEEDBACK_NON_OPTIMAL)
         self.scanned = 0
 
-    @property
-    def gains(self) -> list[float]:
-        """Gains that were set, in order."""
-        asked = [r.subject for r in self.requests if r.kind == ControlRequest.SET_ZCTRL_PARAMS]
-        return [feedback.integral_gain for feedback in asked]
+    def answer(self, request: Request) -> Response:
+        """Note the gains that come into force, in order, also those that are set back."""
+        lent = names.ZCTRL_IGAIN in self.bases
+        response = super().answer(request)
+        is_set = request.kind in (LEND_REQUEST, ControlRequest.SET_ZCTRL_PARAMS)
+        if response.ok and isinstance(request.subject, Feedback):
+            self.values[names.ZCTRL_IGAIN] = str(request.subject.integral_gain)
+            self.bases.pop(names.ZCTRL_IGAIN, None)
+        if response.ok and (is_set or (lent and request.kind == RETURN_REQUEST)):
+            self.gains.append(float(self.values[names.ZCTRL_IGAIN]))
+            self.publish(Feedback(on=True, integral_gain=self.gains[-1]))
+        return response
 
     @property
     def problems(self) -> tuple[int, ...]:
@@ -116,13 +126,13 @@ def test_refused_gain_ends_the_search_there() -> None:
     lab = Rig(lambda gain: off_by(0.5))
 
     def refuse(request: Request) -> Response | str:
-        if request.kind == ControlRequest.SET_ZCTRL_PARAMS and request.subject.integral_gain > 3.0:
+        if request.kind == LEND_REQUEST and float(request.subject.parameters[0].value) > 3.0:
             return Response(ControlResponse.PARAM_ERROR, reason="out of [limits]")
         return "go on"
 
     lab.intercept = refuse
     tuned(lab)
-    assert lab.gains == [1.0, 2.0, 4.0, BEFORE]  # paper F3: nothing beyond the bound after the first refusal
+    assert lab.gains == [1.0, 2.0, BEFORE]  # paper F3: nothing beyond the bound after the first refusal
 
 
 def test_signal_held_beside_the_setpoint_is_named_before_the_tip_oscillates(caplog: pytest.LogCaptureFixture) -> None:
@@ -140,28 +150,27 @@ def test_original_or_good_gain_is_set_after_control_was_lost(good: bool) -> None
     lab = Rig(lambda gain: off_by(0.06 if good and gain == 4.0 else 0.5))
     lab.at(350.0, lambda: lab.clear(Problem.FEEDBACK_NON_OPTIMAL))  # a person says that it is well
     tuned(lab)
-    assert lab.gains[-2:] == ([8.0, 4.0] if good else [8.0, BEFORE])
+    assert lab.gains[-3:] == ([8.0, BEFORE, 4.0] if good else [4.0, 8.0, BEFORE])
 
 
-def test_original_gain_is_restored_after_a_kill(tmp_path: Path) -> None:
-    killed = Rig(lambda gain: off_by(0.5))
-    killed.at(250.0, killed.kill)
+def test_good_gain_is_set_after_a_kill(tmp_path: Path) -> None:
+    killed = Rig(lambda gain: off_by(0.06 if gain == 4.0 else 0.5))
+    killed.at(350.0, killed.kill)
     run(tuner(), killed, tmp_path)
-    assert killed.gains[-1] != BEFORE
+    assert killed.gains[-1] == 8.0
     later = Rig(lambda gain: off_by(0.5))
-    later.publish(Feedback(on=True, integral_gain=killed.gains[-1]))
     later.clear(Problem.FEEDBACK_NON_OPTIMAL)
     later.at(250.0, later.kill)
     run(tuner(), later, tmp_path)
-    assert later.gains == [BEFORE]
+    assert later.gains == [4.0]
 
 
 def test_gain_of_a_person_stays_after_a_kill(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    killed = Rig(lambda gain: off_by(0.5))
-    killed.at(250.0, killed.kill)
+    killed = Rig(lambda gain: off_by(0.06 if gain == 4.0 else 0.5))
+    killed.at(350.0, killed.kill)
     run(tuner(), killed, tmp_path)
     later = Rig(lambda gain: off_by(0.5))
-    later.publish(Feedback(on=True, integral_gain=0.3))
+    later.values[names.ZCTRL_IGAIN] = "0.3"
     later.clear(Problem.FEEDBACK_NON_OPTIMAL)
     later.at(250.0, later.kill)
     run(tuner(), later, tmp_path)
@@ -203,29 +212,19 @@ def test_gain_is_set_back_when_a_scan_is_refused_with_it() -> None:
     assert lab.gains[-1] == BEFORE
 
 
-def test_gain_to_be_set_back_is_named_when_the_experiment_ends_in_the_search(caplog: pytest.LogCaptureFixture) -> None:
-    lab = Rig(lambda gain: off_by(0.5))
-    lab.at(250.0, lab.kill)
-    run(tuner(), lab)
-    assert lab.gains[-1] == 4.0
-    assert "before the integral gain, now 4, is set back to 1" in caplog.text
-
-
-def test_gain_goes_back_in_steps_if_a_limit_refuses_the_whole_way() -> None:
-    lab = Rig(lambda gain: off_by(0.5))
+def test_good_gain_is_set_in_steps_if_a_limit_refuses_the_whole_way() -> None:
+    lab = Rig(lambda gain: off_by(0.06 if gain == 4.0 else 0.5))
 
     def refuse(request: Request) -> Response | str:
-        if request.kind == ControlRequest.SET_ZCTRL_PARAMS:
-            if abs(request.subject.integral_gain - in_force[-1]) > 4.0:
-                return Response(ControlResponse.PARAM_ERROR, reason="a step of 9")
-            in_force.append(request.subject.integral_gain)
-        return "go on"
+        far = (
+            request.kind == ControlRequest.SET_ZCTRL_PARAMS and abs(request.subject.integral_gain - lab.gains[-1]) > 4.0
+        )
+        return Response(ControlResponse.PARAM_ERROR, reason="a step of 6") if far else "go on"
 
-    in_force = [BEFORE]
     lab.intercept = refuse
     tuned(lab)
-    assert max(in_force) == 10.0
-    assert in_force[-1] == BEFORE
+    assert max(lab.gains) == 10.0
+    assert lab.gains[-2:] == [8.0, 4.0]
     assert lab.problems == ()
 
 
@@ -235,12 +234,10 @@ def test_a_gain_that_cannot_be_set_back_stops_the_scans_until_a_person_has_looke
     lab = Rig(lambda gain: off_by(0.5))
 
     def refuse(request: Request) -> Response | str:
-        if request.kind == ControlRequest.SET_ZCTRL_PARAMS and request.subject.integral_gain < max(lab.gains):
-            return Response(ControlResponse.PARAM_ERROR, reason="not downwards")
-        return "go on"
+        return Response(ControlResponse.SUCCESS) if request.kind == RETURN_REQUEST else "go on"
 
     lab.intercept = refuse
     tuned(lab)
     assert set(lab.problems) == {Problem.FEEDBACK_NON_OPTIMAL, Problem.DEVICE_MALFUNCTION}
-    assert "integral gain 1 can't be set again: the setting of the feedback was refused: not downwards" in caplog.text
+    assert "integral gain 1 can't be set again: the log of the scheduler says why" in caplog.text
     assert "as before" not in caplog.text

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -179,17 +177,6 @@ def test_refused_rescan_counts_as_failed(kind: int, left: tuple[int, ...]) -> No
     assert run(Rescanner(), lab) == ExitCode.ENDED  # and did not crash over it
     assert not lab.finished
     assert lab.problems == left
-
-
-def test_original_direction_is_restored_after_a_kill(tmp_path: Path) -> None:
-    (tmp_path / "rescanner.json").write_text(json.dumps({"direction_before": names.UP}))
-    lab = Drifting(["well"])
-    lab.values[names.SCAN_DIRECTION] = names.DOWN  # set in an earlier life
-    lab.at(10.0, lambda: lab.wants(RescanKind.OPPOSITE, upwards=False))
-    lab.at(5000.0, lab.kill)
-    assert run(Rescanner(), lab, state_dir=tmp_path) == ExitCode.ENDED
-    assert lab.values[names.SCAN_DIRECTION] == names.UP
-    assert "direction_before" not in json.loads((tmp_path / "rescanner.json").read_text())
 
 
 def test_rescan_requested_by_its_own_scans_is_not_repeated() -> None:

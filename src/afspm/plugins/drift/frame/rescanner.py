@@ -17,7 +17,7 @@ WANTED, MAPPINGS = "DriftRescan", "DriftMapping"
 FLAGGED_WITHIN_S = 5.0
 BACK_WITHIN_S = 60.0
 _PIXELS_AT_ONCE = 16
-_DIRECTION_BEFORE, _FRAME_BEFORE = "direction_before", "frame_before"
+_FRAME_BEFORE = "frame_before"
 Pixels = tuple[int, int] | None
 
 _IN_WORDS: dict[int, str] = {
@@ -107,35 +107,24 @@ class Rescanner(Component):
         assert isinstance(region, Region)
         assert shape is None or isinstance(shape, tuple)
         try:
-            self._set_direction(message)
-            if kind == RescanKind.SEARCH:
-                self._save_setting(_FRAME_BEFORE, [*region.center_m, *region.size_m, region.angle_rad, shape])
-            for attempt in range(1 if kind == RescanKind.OPPOSITE else self.attempts):
-                self._drop_waiting(mappings)
-                if kind == RescanKind.SEARCH:
-                    self._search(region, shape, attempt + 1)
-                else:
-                    self.scope.scan(region, shape=shape)
-                if self._is_accepted(kind, mappings):
-                    return True
+            if kind == RescanKind.SEARCH:  # saved, so that it is also restored after a kill
+                self.memory.setdefault(_FRAME_BEFORE, [*region.center_m, *region.size_m, region.angle_rad, shape])
+                self.memory.save()
+            direction = names.UP if message.upwards else names.DOWN
+            with self.scope.settings({names.SCAN_DIRECTION: direction} if message.HasField("upwards") else {}):
+                for attempt in range(1 if kind == RescanKind.OPPOSITE else self.attempts):
+                    self._drop_waiting(mappings)
+                    if kind == RescanKind.SEARCH:
+                        self._search(region, shape, attempt + 1)
+                    else:
+                        self.scope.scan(region, shape=shape)
+                    if self._is_accepted(kind, mappings):
+                        return True
             return False
         finally:
-            self._restore_settings()
+            self._restore_frame()
 
-    def _set_direction(self, message: DriftRescan) -> None:
-        if message.HasField("upwards"):
-            self._save_setting(_DIRECTION_BEFORE, str(self.scope.get(names.SCAN_DIRECTION)))
-            self.scope.set(names.SCAN_DIRECTION, names.UP if message.upwards else names.DOWN)
-
-    def _save_setting(self, name: str, value: object) -> None:
-        # saved, so that settings are also restored after a kill
-        self.memory.setdefault(name, value)
-        self.memory.save()
-
-    def _restore_settings(self) -> None:
-        if (direction := self.memory.get(_DIRECTION_BEFORE)) is not None:
-            self.scope.set(names.SCAN_DIRECTION, direction)
-            self.memory.pop(_DIRECTION_BEFORE)
+    def _restore_frame(self) -> None:
         if (frame := self.memory.get(_FRAME_BEFORE)) is not None:
             self._restore_region(*frame)
             self.memory.pop(_FRAME_BEFORE)
@@ -143,13 +132,13 @@ class Rescanner(Component):
 
     def _restore_after_lost_control(self) -> None:
         # control may be lost before the restoration, when another component clears the drift
-        if _DIRECTION_BEFORE not in self.memory and _FRAME_BEFORE not in self.memory:
+        if _FRAME_BEFORE not in self.memory:
             return
         try:
             with self.scope.control(timeout_s=BACK_WITHIN_S):
-                self._restore_settings()
+                self._restore_frame()
         except (ControlLost, Refused) as error:
-            self.log.warning("direction and region of the scans before could not be set again: %s", error.what)
+            self.log.warning("the region of the scans before could not be set again: %s", error.what)
 
     def _search(self, region: Region, shape: Pixels, times: int) -> None:
         # a wider region, at most the widest that limits and scanner allow
