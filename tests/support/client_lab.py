@@ -350,6 +350,8 @@ class Lab:
             case ControlRequest.PARAM, Parameter(name, value, unit):
                 if value is not None:
                     self.values[name] = value
+                elif name.removesuffix(".now") not in self.values:
+                    return Response(ControlResponse.PARAM_NOT_SUPPORTED, reason=f"no parameter {name}")
                 return Response(0, wire.encode(Parameter(name, self.values[name.removesuffix(".now")], unit or "V"))[1])
         self.executed.append(request.id)
         return Response(ControlResponse.SUCCESS)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from afspm.basics.units import convert
 from afspm.components.tip_judge import TipJudge, Verdict
 from afspm.model import Scan
+from afspm.model.caption import picture_settings
 
 ENOUGH_SCANS = 3  # before a channel counts as missing; the channels of one scan come one by one
 
@@ -28,7 +29,8 @@ class HeightPair:
         """
         retrace = None if self.retrace is None else self.retrace.values * convert(1.0, self.retrace.unit, "m")
         trace = self.trace.values * convert(1.0, self.trace.unit, "m")
-        return judge.judge(trace, retrace, self.trace.region, learns=learns)
+        settings = picture_settings(self.trace.in_force)
+        return judge.judge(trace, retrace, self.trace.region, settings=settings, learns=learns)
 
 
 class ChannelPairing:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from afspm.basics import ControlLost, Speed, Voltage
 from afspm.basics.errors import AfspmError, ConfigError, FileError, NoResponse, Refused
@@ -23,9 +23,10 @@ from afspm.components.tip_treatments import Treatment, TreatmentPlaces, treatmen
 from afspm.components.tip_verdict import read_verdict
 from afspm.components.tip_workshop import DONE_ACTION, TipWorkshop
 from afspm.model import HEIGHT, HEIGHT_RETRACE, ChannelName, Problem, Region, Scan, ScanSet, names
+from afspm.model.caption import picture_settings, settings_to_lend
 
-Frame = list[list[float]]
-"""Region and pixels in JSON's types: centre, size and angle; rows and columns.
+Frame = list[Any]
+"""Region, pixels and settings in JSON's types: centre, size and angle; rows and columns; values to lend, by parameter.
 
 The frame of the fault comes from the verdict, not from the flag: in a survey the region set last is often another kind
 of scan, which never showed the fault, and a flag of a published peer or of a person has no frame. The classifier
@@ -134,6 +135,7 @@ class TipCorrector(Component):
 
     def run(self) -> None:
         self._workshop = TipWorkshop(self, self.problem, self.places, self._charge)
+        self._settings: dict[str, str] = {}  # of the newest scan, or of the one that was found bad
         self._account = RepairAccount(self.budget, self.places.spacing_m, self.memory)
         self._experience: NightsExperience | None = None
         if self.experience_file is not None:
@@ -150,7 +152,11 @@ class TipCorrector(Component):
             problems = self.scope.control_state.problems
             for event in events:
                 if isinstance(event.message, Scan):
-                    frames[event.message.time_ns] = _packed(event.message.region, event.message.shape)
+                    self._settings = settings_to_lend(event.message.in_force)
+                    frames[event.message.time_ns] = [
+                        *_packed(event.message.region, event.message.shape),
+                        self._settings,
+                    ]
                     if len(frames) > LAST_FRAMES:
                         del frames[next(iter(frames))]
                     self._learn(event.message, problems)
@@ -196,6 +202,8 @@ class TipCorrector(Component):
             return
         bad = self.memory.get("judged_bad")
         seen, shape = _unpacked(bad) if bad else (region, shape)
+        if bad and len(bad) > 2:  # like is compared with like
+            self._settings = bad[2]
         test = seen if self.test_center is None else seen.moved_to(self.test_center)
         looks = (test, seen, seen) if self.test_center else (seen,) * 3
         tried = int(self.memory.get("tried", 0))
@@ -302,7 +310,7 @@ class TipCorrector(Component):
         refused: list[str] = []
         for place in looks:
             try:
-                scans = self.scope.scan(place, shape=shape)
+                scans = self.scope.scan(place, shape=shape, settings=self._settings)
             except (Refused, NoResponse) as error:
                 self.log.warning("no test scan at %s: %s", position_text(place.center_m), error.what)
                 refused.append(error.what)
@@ -353,7 +361,10 @@ class TipCorrector(Component):
         return tip_verdict.BAD
 
     def _learn(self, scan: Scan, problems: tuple[int, ...]) -> None:
-        if self.judge is None or problems or (self._experience is None and self.judge.knows(scan.region, scan.shape)):
+        if self.judge is None or problems:
+            return
+        settings = picture_settings(scan.in_force)
+        if self._experience is None and self.judge.knows(scan.region, scan.shape, settings):
             return
         pair = self.pairing.add(scan)
         if pair is None:
@@ -395,7 +406,7 @@ def _packed(region: Region, shape: tuple[int, int] | None) -> Frame:
 
 
 def _unpacked(frame: Frame) -> tuple[Region, tuple[int, int] | None]:
-    (x, y, width, height, angle), shape = frame
+    (x, y, width, height, angle), shape, *_ = frame
     return Region((x, y), (width, height), angle), (int(shape[0]), int(shape[1])) if shape else None
 
 

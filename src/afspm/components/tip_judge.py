@@ -5,7 +5,8 @@ scans, since the sample drifts; the first scans stay as the measure of slow wear
 no place explains: a large loss of detail, or debris. At an unknown place a ghost image looks like order of the sample.
 
 Scans of another size or number of pixels have a reference of their own, since the effect of a tip on a scan depends on
-the pixel: a fault in a zoom may be finer than the pixels of an overview. A reference is begun only while all others
+the pixel: a fault in a zoom may be finer than the pixels of an overview. So have scans with another bias, setpoint,
+speed or gain: the first scan of a place at four times the speed looks blunt. A reference is begun only while all others
 show a good tip, and a fault found in one kind of scan is over only when an equally fine kind shows none.
 
 Measured on simulated nights (128 x 128 pixels, 8 seeds, slow drift, one scan judged by itself, known places):
@@ -23,8 +24,10 @@ particles and stamper. On rough ground and steps only debris was detected, as ab
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
+from types import MappingProxyType
 
 import numpy as np
 
@@ -41,6 +44,7 @@ from afspm.components.tip_metrics import (
 )
 from afspm.model import Region
 from afspm.model.arrays import Array, robust_spread
+from afspm.model.caption import are_alike
 from afspm.model.snapshot import from_plain, to_plain
 
 REACH_PX = 32  # search range for the second apex of a double tip
@@ -56,6 +60,7 @@ NOISIER = 2.0  # times the usual noise, above which only unrest shows that a tip
 UNCERTAIN = 0.99  # of the way to a limit
 FEWEST_AT_END = 0.005  # share of the pixels at the highest or lowest value of a scan that ends at its range
 FLOORS = TipMetrics(detail=0.02, ghost=0.01, unrest_m=0.15, contrast=0.0)  # least spreads: few scans underestimate them
+NO_SETTINGS: Mapping[str, float] = MappingProxyType({})
 Fault = tuple[float, str, str]
 """A fault: its size relative to the limit for a bad scan (1), the flaw, and the reason."""
 BLUNT, DOUBLE, CONTAMINATED = FLAWS = ("blunt", "double", "contaminated")
@@ -141,10 +146,11 @@ class KnownPlace:
 
 @dataclass
 class TipReference:
-    """The reference for one kind of scan (same size, angle and shape), from scans with a good tip.
+    """The reference for one kind of scan (same size, angle, shape and settings), from scans with a good tip.
 
     Attributes:
         size_m, angle_rad, shape: size, angle and shape of these scans.
+        settings: their bias, setpoint and speed, and gains of the run, as far as known.
         places: the places of these scans, the last seen at the end.
         first: metrics of the scans that were learnt from.
         deviations: differences of such scans at the same place: detail and unrest as ratios, ghost unchanged.
@@ -160,14 +166,16 @@ class TipReference:
     deviations: list[TipMetrics] = field(default_factory=list)
     suspect: bool = False
     confirmed: bool = False
+    settings: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def pixel_m(self) -> float:
         return max(size / pixels for size, pixels in zip(self.size_m, reversed(self.shape), strict=True))
 
-    def fits(self, region: Region, shape: tuple[int, int]) -> bool:
+    def fits(self, region: Region, shape: tuple[int, int], settings: Mapping[str, float]) -> bool:
         by = self._at(region.center_m).compared(region)
-        return max(by.size, abs(by.turned_rad)) < SAME_SIZE and shape == self.shape
+        is_alike = shape == self.shape and are_alike(settings, self.settings)
+        return max(by.size, abs(by.turned_rad)) < SAME_SIZE and is_alike
 
     def _at(self, center_m: tuple[float, float]) -> Region:
         return Region(center_m, self.size_m, self.angle_rad)
@@ -236,9 +244,9 @@ class TipJudge:
         """References, complete and incomplete, the last used at the end."""
         return tuple(self._state.kinds)
 
-    def knows(self, region: Region, shape: tuple[int, int]) -> bool:
-        """Return whether the reference for scans of this size, angle and shape is complete."""
-        return any(self._is_known(kind) and kind.fits(region, shape) for kind in self._state.kinds)
+    def knows(self, region: Region, shape: tuple[int, int], settings: Mapping[str, float] = NO_SETTINGS) -> bool:
+        """Return whether the reference for scans of this size, angle, shape and settings is complete."""
+        return any(self._is_known(kind) and kind.fits(region, shape, settings) for kind in self._state.kinds)
 
     def state(self) -> Plain:
         """Return the state to save, in JSON's types."""
@@ -254,23 +262,33 @@ class TipJudge:
         for kind in self._state.kinds:
             kind.suspect = False
 
-    def judge(self, trace: Array, retrace: Array | None, region: Region, *, learns: bool = True) -> Verdict:
+    def judge(
+        self,
+        trace: Array,
+        retrace: Array | None,
+        region: Region,
+        *,
+        settings: Mapping[str, float] = NO_SETTINGS,
+        learns: bool = True,
+    ) -> Verdict:
         """Return the verdict on a scan.
 
         Args:
             trace, retrace: heights in m, [y, x]; retrace None if not recorded.
             region: the scanned region.
+            settings: `caption.picture_settings` of the scan.
             learns: whether a scan may be added to an incomplete reference, or begin one.
         """
         shape = (trace.shape[0], trace.shape[1])
-        if not self.knows(region, shape) and not (learns and self._is_trusted):
-            why = f"no reference of {_kind_text(region, shape)}, and none is begun while the tip may be bad"
+        if not self.knows(region, shape, settings) and not (learns and self._is_trusted):
+            of = _kind_text(region, shape)
+            why = f"no reference of {of} with these settings, and none is begun while the tip may be bad"
             return Verdict(Opinion.UNCLEAR, why)
         try:
             seen_slopes = slopes(trace, retrace)
         except InvalidValue as error:
             return Verdict(Opinion.UNCLEAR, error.what)
-        kind = self._reference_for(region, shape)
+        kind = self._reference_for(region, shape, settings)
         place = kind.place(region)
         correlation = autocorrelation(seen_slopes, min(REACH_PX, min(shape) // 3))
         measured = metrics(seen_slopes, correlation, place.expected if place else None)
@@ -299,14 +317,14 @@ class TipJudge:
     def _is_known(self, kind: TipReference) -> bool:
         return len(kind.first) >= self.reference_scans
 
-    def _reference_for(self, region: Region, shape: tuple[int, int]) -> TipReference:
+    def _reference_for(self, region: Region, shape: tuple[int, int], settings: Mapping[str, float]) -> TipReference:
         kinds = self._state.kinds
-        kind = next((known for known in kinds if known.fits(region, shape)), None)
+        kind = next((known for known in kinds if known.fits(region, shape, settings)), None)
         if kind is not None:
             kinds.remove(kind)
         elif len(kinds) >= MOST_KINDS:
             kinds.remove(next((known for known in kinds if not self._is_known(known)), kinds[0]))
-        kind = kind or TipReference(region.size_m, region.angle_rad, shape)
+        kind = kind or TipReference(region.size_m, region.angle_rad, shape, settings=dict(settings))
         kinds.append(kind)
         return kind
 

@@ -6,6 +6,7 @@ value that neither of them knows is None, never guessed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -28,6 +29,9 @@ _OF_ANY: Final = (
     names.TIP_BIAS_VOLTAGE, BIAS_REFERENCE, names.SAMPLE_BIAS, names.ZCTRL_SETPOINT, names.SCAN_SPEED,
     names.FEEDBACK_ON, SPRING_CONSTANT, SENSITIVITY,
 )  # fmt: skip
+_GAINS: Final = (names.ZCTRL_PGAIN, names.ZCTRL_IGAIN)  # known where the run has set them; no part of a caption
+_COMPARED: Final = (names.TIP_BIAS_VOLTAGE, names.SAMPLE_BIAS, names.ZCTRL_SETPOINT, names.SCAN_SPEED, *_GAINS)
+_ALIKE: Final = 0.02  # relative: what a picture does not show
 _SYMBOLS: Final = {names.TIP_BIAS_VOLTAGE: "V", names.SAMPLE_BIAS: "V(sample)", SPRING_CONSTANT: "k"}
 _OF_SETPOINT: Final = {"A": "I", "N": "F", "Hz": "Δf"}
 Value = float | str | bool
@@ -44,7 +48,7 @@ def captioned(known: Iterable[str], *, of_scan: bool) -> list[str]:
 
 
 def _is_captioned(name: str) -> bool:
-    return name in _OF_ANY or (name.startswith((_LOCK_IN, _SPECTROSCOPY)) and name != names.SPEC_KIND)
+    return name in (*_OF_ANY, *_GAINS) or (name.startswith((_LOCK_IN, _SPECTROSCOPY)) and name != names.SPEC_KIND)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,10 +127,28 @@ def caption(settings: Sequence[SettingInForce]) -> str:
         for one in settings
         if one.text
         and one is not feedback
-        and one.name != BIAS_REFERENCE
+        and one.name not in (BIAS_REFERENCE, *_GAINS)
         and not (is_off and one.name == names.ZCTRL_SETPOINT)
     ]
     return ", ".join(parts + (["feedback off"] if is_off else []))
+
+
+def picture_settings(settings: Iterable[SettingInForce]) -> dict[str, float]:
+    """Return the settings on which a picture of one place depends: bias, setpoint, speed, and gains of the run."""
+    return {one.name: one.constant for one in settings if one.name in _COMPARED and one.constant is not None}
+
+
+def settings_to_lend(settings: Iterable[SettingInForce]) -> dict[str, str]:
+    """Return the settings of `picture_settings` as texts, with which a further scan shows the same."""
+    known = {one.name: one for one in settings}
+    return {name: f"{value:.9g} {known[name].unit}".strip() for name, value in picture_settings(known.values()).items()}
+
+
+def are_alike(one: Mapping[str, float], other: Mapping[str, float]) -> bool:
+    """Return whether pictures with these settings can be compared; a gain that one of them states makes them differ."""
+    if any((gain in one) is not (gain in other) for gain in _GAINS):
+        return False
+    return all(math.isclose(one[name], other[name], rel_tol=_ALIKE) for name in one.keys() & other.keys())
 
 
 def _rank(name: str) -> tuple[int, str]:

@@ -13,7 +13,7 @@ from tests.unit.components.tip_scans_lab import ELSEWHERE, HOME, PIXELS, channel
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.components.tip_judge import Opinion, TipJudge, TipTolerance, Verdict, VerdictCounter
 from afspm.components.tip_metrics import autocorrelation, ghost, slopes
-from afspm.model import Region, Scan
+from afspm.model import Region, Scan, names
 
 LEARN = 3
 FLAWS = ("double", "blunt", "contaminated")
@@ -301,3 +301,15 @@ def test_invalid_tolerances_are_refused(wrong: dict[str, float]) -> None:
 def test_single_reference_scan_is_too_few() -> None:
     with pytest.raises(ConfigError):
         TipJudge(1)
+
+
+# settings: two plans scan one place with another speed each
+def test_scans_with_other_settings_have_a_reference_of_their_own() -> None:
+    pairs, judge = channels(1, "blunt", 5), TipJudge(LEARN)
+    slow, fast = {names.SCAN_SPEED: 2e-6}, {names.SCAN_SPEED: 8e-6}
+    opinions = []
+    for (trace, retrace), settings in [*((pair, slow) for pair in pairs[:LEARN]), (pairs[5], fast), (pairs[5], slow)]:
+        opinions.append(judge.judge(trace.values, retrace.values, trace.region, settings=settings).opinion)
+    assert opinions == [Opinion.LEARNING] * (LEARN + 1) + [Opinion.BAD]
+    assert judge.knows(HOME, pairs[0][0].shape, slow)
+    assert not judge.knows(HOME, pairs[0][0].shape, fast)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from afspm.model import MeasurementConditions, Parameter
-from afspm.model.caption import SettingInForce, caption, captioned, stated_settings
+from afspm.model.caption import SettingInForce, are_alike, caption, captioned, picture_settings, stated_settings
 
 BEGIN = (
     Parameter("scan-speed", "5", "nm/s"),
@@ -51,7 +51,24 @@ def test_setpoint_of_another_mode_is_another_column() -> None:
 
 def test_settings_of_an_earlier_version_are_those_of_the_run() -> None:
     earlier = MeasurementConditions(1, "", begin_values=(BEGIN[3], Parameter("zctrl-igain", "5")))
-    assert earlier.in_force == (SettingInForce("tip-bias-voltage", "V", 0.1, None),)
+    bias, gain = SettingInForce("tip-bias-voltage", "V", 0.1, None), SettingInForce("zctrl-igain", "", 5.0, None)
+    assert earlier.in_force == (bias, gain)
+    assert earlier.caption() == "V = 100 mV", "a gain is for comparisons, and no part of a caption"
+
+
+# settings: one place alternately at two speeds, the tip unchanged
+def test_pictures_with_other_settings_are_not_compared() -> None:
+    def of(**values: float) -> dict[str, float]:
+        given = ((name.replace("_", "-"), value) for name, value in values.items())
+        return picture_settings(SettingInForce(name, "", value, value) for name, value in given)
+
+    slow = of(scan_speed=2e-6, tip_bias_voltage=0.5)
+    assert are_alike(slow, of(scan_speed=2.001e-6, tip_bias_voltage=0.5))
+    assert not are_alike(slow, of(scan_speed=8e-6, tip_bias_voltage=0.5))
+    assert not are_alike(slow, of(scan_speed=2e-6, tip_bias_voltage=-0.5))
+    assert are_alike(slow, of(scan_speed=2e-6)), "what is not known counts as alike"
+    assert not are_alike(slow, {**slow, "zctrl-igain": 5.0}), "a gain is known where the run has set it"
+    assert picture_settings([SettingInForce("scan-speed", "m/s", 1e-6, 2e-6)]) == {}, "changed during the scan"
 
 
 def test_few_parameters_are_read_for_a_caption() -> None:

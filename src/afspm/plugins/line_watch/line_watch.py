@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import logging
-from contextlib import ExitStack
+from collections.abc import Mapping
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
 from afspm import Component, Events, PublishedEvent
-from afspm.basics import NS_PER_S, UnitError, convert
+from afspm.basics import NS_PER_S, RequestError, UnitError, convert
 from afspm.components import Array, ChannelPairing, HeightPair, MissingChannels, Publication, tip_verdict
 from afspm.model import (
     HEIGHT,
@@ -22,7 +23,9 @@ from afspm.model import (
     ScanLines,
     ScopeState,
     ScopeStatus,
+    names,
 )
+from afspm.model.caption import picture_settings
 from afspm.plugins.line_watch.line_judge import (
     Alarm,
     AlarmLevel,
@@ -37,6 +40,8 @@ from afspm.wire.messages import SpatialROIWithScoreList, WatchCounts
 COUNTS = "WatchCounts"  # how many scans were watched: see `proto/lines.proto`
 KEPT_TIMES = 16  # number of scans learnt from whose times are saved: a restarted process may receive them again
 NOISIER = 1.12  # relative noise of the newest lines above which it is reported
+_READ_WITHIN_S = 2.0  # a busy controller may answer later: then bias and speed count as unknown
+_CARRIED = (names.TIP_BIAS_VOLTAGE, names.SCAN_SPEED)
 _SCANS_WITHOUT_LINES = 3  # a short scan may end before its first lines are published
 
 
@@ -130,10 +135,10 @@ class LineWatch(Component):
     With `action = "stop"` an alarm of the higher level also flags `tip-shape-changed`: the scheduler stops the scan, so
     its remaining time is saved. Each line is compared with an earlier scan of the place at the predicted drift; without
     an earlier scan, nothing is judged. The component learns from the first scans of each size, angle, number of pixels
-    and setting of the feedback, so the tip must be good then: the first scan judged is the fourth of a place, at later
-    places the second. A scan teaches nothing if an alarm was raised, a problem flagged or the feedback changed during
-    the scan, or if a `TipClassifier` judges it as bad. But two successive scans of a place that agree with each other
-    replace the earlier scan from which they differ, as after the arrival of an adsorbate.
+    and setting of bias, speed and feedback, so the tip must be good then: the first scan judged is the fourth of a
+    place, at later places the second. A scan teaches nothing if an alarm was raised, a problem flagged or the feedback
+    changed during the scan, or if a `TipClassifier` judges it as bad. But two successive scans of a place that agree
+    with each other replace the earlier scan from which they differ, as after the arrival of an adsorbate.
 
     The component publishes a `TipVerdict` with the row of the alarm, the first row with the change, and a confidence.
     After each complete scan it publishes `WatchCounts`: how many scans it watched so far, and how many lines came late.
@@ -173,6 +178,7 @@ class LineWatch(Component):
         self._seen_ns: int | None = None  # time of the newest complete scan
         self._problems: tuple[int, ...] | None = None  # not known yet
         self._condition = ""
+        self._carried = ""  # bias and speed of the newest scan
         self._refused: set[str] = set()
         self._not_judged: set[str] = set()  # reasons that were logged
 
@@ -306,7 +312,8 @@ class LineWatch(Component):
         self._later_states.since(self._packet_ns)
         self._lines = _Lines(lines.began_ns, None)
         if self._problems == ():  # the scans of a repair are not the experiment's
-            kind = Kind.of(lines.region, lines.shape, self._condition)
+            self._carried = self._bias_and_speed()
+            kind = Kind.of(lines.region, lines.shape, self._condition_of(self._carried))
             self._lines.judge = self.judge.begin(
                 lines.region, kind, self._time_s(lines.began_ns), channels=len(self.channels)
             )
@@ -417,8 +424,21 @@ class LineWatch(Component):
             return None
         return WholeScan(picture, trace.region, finished.kind, self._time_s(trace.time_ns), finished.downwards)
 
+    def _bias_and_speed(self) -> str:
+        # each measurement may carry its own; they are published at its end alone
+        found = dict[str, float]()
+        for name in _CARRIED:
+            with suppress(RequestError):  # a microscope without it, or one that does not answer now
+                found[name] = float(self.scope.get(name, timeout_s=_READ_WITHIN_S))
+        return _carried_text(found)
+
+    def _condition_of(self, carried: str) -> str:
+        return f"{self._condition} {carried}".strip()
+
     def _kind(self, scan: Scan) -> Kind:
-        return Kind.of(scan.region, scan.shape, self._condition)
+        if not (carried := _carried_text(picture_settings(scan.in_force)) or self._carried):
+            carried = self._carried = self._bias_and_speed()  # of a scan before this process was started
+        return Kind.of(scan.region, scan.shape, self._condition_of(carried))
 
     def _time_s(self, time_ns: int | None) -> float:
         return self.clock.now_s() if time_ns is None else time_ns / NS_PER_S
@@ -427,6 +447,10 @@ class LineWatch(Component):
         if channel not in self._refused:
             self._refused.add(channel)
             self.log.error("%s is not a height, so nothing is judged: %s", channel, error)
+
+
+def _carried_text(values: Mapping[str, float]) -> str:
+    return "/".join(f"{values[name]:.3g}" for name in _CARRIED if name in values)
 
 
 def _is_there(values: Array) -> bool:
