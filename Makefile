@@ -279,9 +279,11 @@ HOURS ?= 20000
 SEED ?= 1
 HOLDS ?= 200
 MOVES ?= 200
+SHARED ?= 200
 simulate: $(TEST)
 	@$(BIN)/python -m tests.simulation.held_z_kills $(HOLDS)
 	@$(BIN)/python -m tests.simulation.mover_nights $(MOVES)
+	@$(BIN)/python -m tests.simulation.shared_nights $(SHARED)
 	@$(BIN)/python -m tests.simulation.long_run --hours $(HOURS) --seed $(SEED)
 
 ## nights with kills, replayed by what-if without a change: NIGHTS=200 SEED=0

@@ -11,7 +11,6 @@ the value at the start, or the last decision: of a person at the panel, or of a 
 from __future__ import annotations
 
 import argparse
-import inspect
 import json
 import logging
 import math
@@ -24,11 +23,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal
+from unittest.mock import patch
 
 from afspm import Component, Region, wire
 from afspm.basics.errors import AfspmError, ControlLost, NoResponse, Refused
-from afspm.client.scope import Scope
 from afspm.components.planned_scans import ListedRegion, ScanList, ScanSeries
 from afspm.components.spectroscopy_grid import SpectroscopyGrid
 from afspm.components.sweep import KEY, Sweep
@@ -36,17 +35,32 @@ from afspm.components.sweep_at import SweepAt
 from afspm.model import ControlMode, ControlRequest, JournalEntry, MeasurementConditions, Problem, Request, Spectrum
 from afspm.model import names as n
 from afspm.model.events import ControlEvent
+from afspm.scheduler.loans import Loan, LoanBook
+from afspm.scheduler.requests import lending
 from afspm.testing import Bench
 
-Mutant = Literal[""]
-"""A part of the book of loans that is left out, so that a night must see it."""
+MUTANTS: Final[Mapping[str, tuple[Any, str, Any]]] = {
+    "compares nothing": (LoanBook, "compared", lambda book, settings, kind: (book, [])),
+    "sets nothing back": (LoanBook, "due", lambda book, action, kind: []),
+    "states for ever": (LoanBook, "nothing_stated", lambda book: book),
+    "base is the last loan": (
+        LoanBook,
+        "sending",
+        lambda book, key, now, value, lender, kind: book._with(key, Loan(now, value, lender or "x", kind)),
+    ),
+    "gives nothing back": (lending, "may_return", lambda draft: False),
+    "gives back in MANUAL": (lending, "may_return", lambda draft: draft.microscope.is_free and draft.forwarder.up),
+    "decides nothing": (LoanBook, "decided", lambda book, parameters, kind: book),
+    "forgets what was stated": (lending, "has_forgotten", lambda draft, job: False),
+    "answers before all is set": (lending, "_in_order", lambda draft, found, way: tuple(way[:1])),
+}
+"""Parts of the book of loans that are left out, each of which a night must see."""
 LASTS_S = 60.0
 RETURNED_WITHIN_S = 60.0  # an end waits for returns, and a lender that has gone is given up after a while
 
 SHOWN: Final = (n.TIP_BIAS_VOLTAGE, n.ZCTRL_SETPOINT, n.ZCTRL_PGAIN, n.ZCTRL_IGAIN)  # the truth shows each change
 OF_SCANS: Final = (*SHOWN, n.SCAN_SPEED)
 OF_CURVES: Final = (n.SPEC_FROM, n.SPEC_TO, n.SPEC_POINTS)
-HAS_SETTINGS: Final = "settings" in inspect.signature(Scope.scan).parameters and hasattr(Scope, "settings")
 
 _START_S = 1.75e9  # experiment time at the start of a bench
 _SHAPE, _SIZE_M = (8, 8), (200e-9, 200e-9)
@@ -221,7 +235,6 @@ def plans(seed: int, setpoint: float) -> list[Plan]:
     scans = ("scan_series", "scan_list")
     kinds = [*scans, "bare", "sweep", "sweep_at", "grid", "curves", "foreign", "solver", "own"]
     found = [draw.choice(scans), *draw.sample(kinds, draw.randrange(1, 5))]
-    found = ["bare" if one == "own" and not HAS_SETTINGS else one for one in found]
     made = [_plan(kind, slot, draw, seed, setpoint) for slot, kind in enumerate(found)]
     return [*made, Plan("flagger", Flagger(seed))] if "solver" in found and draw.random() < 0.7 else made
 
@@ -307,7 +320,7 @@ def events(seed: int, cast: Sequence[Plan], setpoint: float) -> list[Event]:
     return [*found, Event(LASTS_S - 2.0, "manual")] if draw.random() < 0.1 else found
 
 
-def play(seed: int, folder: Path, mutant: Mutant = "", lasts_s: float = LASTS_S) -> Evidence:
+def play(seed: int, folder: Path, lasts_s: float = LASTS_S) -> Evidence:
     """Play the night of a seed, or its beginning, to the end of its run."""
     draw = random.Random(seed)
     mode = draw.choice(tuple(_SETPOINTS))
@@ -560,7 +573,7 @@ class Night:
                 taken = self._taken[file]
                 plan, states = of_place.get(taken.where, (None, {}))
                 if plan is None or plan.name != one.holder:
-                    # the set place was lost on its way: the client finds that the result does not fit, and measures again
+                    # a region of another was lost on its way: the result does not fit, and is measured again
                     self._count("measurement at the place of another")
                     continue
                 self._judge(file, taken, curve, plan, states)
@@ -670,16 +683,18 @@ def _numbers(text: str) -> list[float]:
     return [float(number.replace("\u2212", "-")) * prefixes[prefix] for number, prefix in found]
 
 
-def night(seed: int, folder: Path, mutant: Mutant = "", lasts_s: float = LASTS_S) -> Night:
+def night(seed: int, folder: Path, mutant: str = "", lasts_s: float = LASTS_S) -> Night:
     """Return the verdict on the night of a seed, or on its beginning."""
-    return Night(play(seed, folder, mutant, lasts_s))
+    owner, name, other = MUTANTS.get(mutant, (LoanBook, "due", LoanBook.due))
+    with patch.object(owner, name, other):
+        return Night(play(seed, folder, lasts_s))
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("nights", type=int)
     parser.add_argument("--seed", type=int, default=0, help="seed of the first night")
-    parser.add_argument("--mutant", default="", choices=get_args(Mutant), help="leave a part out")
+    parser.add_argument("--mutant", default="", choices=MUTANTS, help="leave a part out")
     given = parser.parse_args()
     found = []
     for seed in range(given.seed, given.seed + given.nights):
@@ -698,8 +713,8 @@ def report(found: Sequence[Night]) -> str:
         kind: sorted({fault.seed for one in wrong for fault in one.faults if fault.kind == kind}) for kind in kinds
     }
     met = sum((one.met for one in found), Counter[str]())
-    measured, own = sum(one.measured for one in found), "" if HAS_SETTINGS else "; without `settings` of a scope"
-    lines = [f"{len(wrong)} of {len(found)} nights wrong, {measured} measurements{own}", *(f"  {one}" for one in shown)]
+    measured = sum(one.measured for one in found)
+    lines = [f"{len(wrong)} of {len(found)} nights wrong, {measured} measurements", *(f"  {one}" for one in shown)]
     lines += ["faults, nights, first seeds:"]
     lines += [f"{count:6} {len(seeds[kind]):5}  {kind} {seeds[kind][:3]}" for kind, count in kinds.most_common()]
     return "\n".join((*lines, "met:", *(f"{count:6} {kind}" for kind, count in sorted(met.items())), ""))

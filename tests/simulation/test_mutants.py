@@ -287,11 +287,11 @@ def other_problems_are_solved_with_a_tip_that_is_away(patch: Patch) -> None:
 
 
 def the_end_does_not_wait_for_the_tip(patch: Patch) -> None:
-    patch.setattr(ExperimentEnd, "is_due", lambda self, now_s, owes_retract: self.by_s is not None)
+    patch.setattr(ExperimentEnd, "is_due", lambda self, now_s, waits: self.by_s is not None)
 
 
 def the_end_never_comes(patch: Patch) -> None:
-    patch.setattr(ExperimentEnd, "is_due", lambda self, now_s, owes_retract: False)
+    patch.setattr(ExperimentEnd, "is_due", lambda self, now_s, waits: False)
 
 
 def limits_are_not_checked(patch: Patch) -> None:

@@ -100,6 +100,7 @@ class StatusText:
             *self._tip(),
             *self._problems(),
             *self._waits(),
+            *self._lent(),
             self._scanning(),
             *self._progress(),
             *self._end(),
@@ -164,6 +165,12 @@ class StatusText:
         for entry in self._seen.waits_at(self._now_ns):
             until = time_of_day(entry.again_ns or 0)
             yield _label("waits").append(f"{entry.who} until {until}: {entry.reason}", "yellow")
+
+    def _lent(self) -> Iterator[Text]:
+        for loan in self._seen.loans:
+            line = _label("lent").append(loan.text.replace(", lent by", ", by"))
+            line.append("; others may have changed it" if loan.is_unsure else "", "yellow")
+            yield line.append(f"; not set back: {loan.why}" if loan.why else "", "bold red")
 
     def _microscope(self) -> Text:
         line, status = _label("microscope"), self._seen.status
@@ -286,6 +293,18 @@ class StatusText:
             "waits": [
                 {"who": one.who, "what": one.what, "until": _iso(one.again_ns), "reason": one.reason}
                 for one in seen.waits_at(self._now_ns)
+            ],
+            "lent": [
+                {
+                    "parameter": one.value.name,
+                    "value": one.value.value,
+                    "base": one.base.value,
+                    "unit": one.value.unit,
+                    "by": one.lender,
+                    "unsure": one.is_unsure,
+                    "reason": one.why,
+                }
+                for one in seen.loans
             ],
             "state": seen.status.state.name if seen.status else None,
             "scan": None if running is None else {"part": round(running[0], 4), "remaining_s": _seconds(running[1])},

@@ -73,6 +73,8 @@ if TYPE_CHECKING:
         WAIT_FOR_CONTROL,
         ControlRequest,
         ControlResponse,
+        LoanInForce,
+        LoansInForce,
         Parameter,
         Request,
         RescanKind,
@@ -137,6 +139,8 @@ __all__ = [
     "InstrumentReadings",
     "JournalEntries",
     "JournalEntry",
+    "LoanInForce",
+    "LoansInForce",
     "LogLine",
     "LoggedPacket",
     "MeasurementConditions",
@@ -205,7 +209,8 @@ if not TYPE_CHECKING:
             "afspm.model.requests": (
                 "CLOCK_REQUEST COMPARE_REQUEST GRANT_REQUEST HAS_ENDED LEASE_AT_ONCE_S LEASE_REQUEST "
                 "LEND_REQUEST RELAY_REQUEST RESTART_REQUEST RETURN_REQUEST WAIT_FOR_CONTROL ControlRequest "
-                "ControlResponse Parameter Request RescanKind Response ResponseDetail Setting Settings request_name"
+                "ControlResponse LoanInForce LoansInForce Parameter Request RescanKind Response ResponseDetail "
+                "Setting Settings request_name"
             ),
             "afspm.model.scan": "Scan ScanLines ScanParameters ScanSet",
             "afspm.model.scan_history": "ScanHistory",

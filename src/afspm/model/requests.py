@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
+from afspm.basics.formatting import quantity
+
 HAS_ENDED = "the experiment has ended"
 """The reason of every refusal after the end."""
 
@@ -171,6 +173,43 @@ class Settings:
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         return tuple(one.parameter for one in self.settings)
+
+
+@dataclass(frozen=True, slots=True)
+class LoanInForce:
+    """A setting that is in force for one component's measurements.
+
+    Attributes:
+        base: the value in force before, which is set back.
+        is_unsure: whether others may have changed the value since.
+        why: why it can't be set back; empty: nothing is known against it.
+    """
+
+    value: Parameter
+    base: Parameter
+    lender: str
+    is_unsure: bool = False
+    why: str = ""
+
+    @property
+    def text(self) -> str:
+        """The loan as text for people: "tip-bias-voltage 500 mV, lent by a (100 mV before)"."""
+        return f"{self.value.name} {amount_text(self.value)}, lent by {self.lender} ({amount_text(self.base)} before)"
+
+
+@dataclass(frozen=True, slots=True)
+class LoansInForce:
+    """All that the scheduler has lent; without any, all settings are those of before."""
+
+    loans: tuple[LoanInForce, ...] = ()
+
+
+def amount_text(parameter: Parameter) -> str:
+    """Return a value with its unit as text for people."""
+    try:
+        return quantity(float(parameter.value or ""), parameter.unit or "")
+    except ValueError:
+        return parameter.value or "no value"
 
 
 @dataclass(slots=True)

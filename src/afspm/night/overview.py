@@ -25,6 +25,8 @@ from afspm.model import (
     InstrumentReadings,
     JournalEntries,
     JournalEntry,
+    LoanInForce,
+    LoansInForce,
     LogLine,
     MeasurementConditions,
     Note,
@@ -177,6 +179,7 @@ class Overview:
         unread: sentences about messages of the record that can't be read.
         proposals: the proposals of agents by id, newest last, bounded.
         approvals: the approvals in force.
+        loans: the settings that are in force for one component's measurements.
         of_conditions: the numbers of the problems flagged by conditions.
         set_ns: the time of the last accepted request that set each parameter.
         log, alarms, notes, entries, refusals, acts: newest last, bounded; acts are those at the microscope itself.
@@ -206,6 +209,7 @@ class Overview:
         self.unread: tuple[str, ...] = ()
         self.proposals: dict[str, Proposal] = {}
         self.approvals = Approvals()
+        self.loans: tuple[LoanInForce, ...] = ()
         self._approved_ns: dict[str, int] = {}
         self.of_conditions: set[int] = set()
         self.set_ns: dict[str, int] = {}
@@ -468,6 +472,9 @@ class Overview:
     def _on_approvals(self, approvals: Approvals, time_ns: int) -> None:
         self.approvals = approvals
         self._approved_ns |= {one.plan: time_ns for one in approvals.approvals if one.plan}
+
+    def _on_loans(self, loans: LoansInForce, time_ns: int) -> None:
+        self.loans = loans.loans
 
     def _on_control(self, control: ControlState, time_ns: int) -> None:
         self.control = control

@@ -23,15 +23,16 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
-from afspm.basics.formatting import quantity
 from afspm.basics.frozen import replace, without
 from afspm.basics.units import convert
-from afspm.model import Parameter, Setting, names
+from afspm.model import LoanInForce, LoansInForce, Parameter, Setting, names
+from afspm.model.requests import amount_text
 
 SETTLES = frozenset(
     (names.TIP_BIAS_VOLTAGE, names.SAMPLE_BIAS, names.ZCTRL_SETPOINT, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN)
 )
 """The parameters after whose change the feedback needs time."""
+_NONE = LoansInForce()
 _LOCK_IN = frozenset((names.LOCK_IN_AMPLITUDE, names.LOCK_IN_FREQUENCY))  # it modulates during scans, too
 _ROUNDED = 1e-6  # relative: a reading in single precision is the value that was set
 
@@ -64,9 +65,12 @@ class Loan:
         return self.base.name
 
     @property
+    def in_force(self) -> LoanInForce:
+        return LoanInForce(self.value, self.base, self.lender, self.is_unsure, self.why)
+
+    @property
     def text(self) -> str:
-        """The loan as text for people."""
-        return f"{self.name} {amount_text(self.value)}, lent by {self.lender} ({amount_text(self.base)} before)"
+        return self.in_force.text
 
 
 @dataclass(frozen=True)
@@ -80,6 +84,7 @@ class LoanBook:
         is_broken: whether it may have stated something that is not known any more. Not saved.
         free_since_ns: the experiment time since which the microscope is free; None: it is not. Not saved.
         is_compared: whether the translator compares values by itself. Not saved.
+        shown: what was published last; None: nothing since a restart. Not saved.
         again_s: the real time before which no return is tried again. Not saved.
     """
 
@@ -90,7 +95,17 @@ class LoanBook:
     is_broken: bool = False
     free_since_ns: int | None = None
     is_compared: bool = True
+    shown: LoansInForce | None = _NONE
     again_s: float = 0.0
+
+    @classmethod
+    def restored(cls, loans: Mapping[str, Loan], lent_last: str) -> LoanBook:
+        """Return the book after a restart, which others may have used to act."""
+        return cls(loans, lent_last=lent_last, shown=None if lent_last else _NONE)
+
+    @property
+    def in_force(self) -> LoansInForce:
+        return LoansInForce(tuple(loan.in_force for loan in self.loans.values()))
 
     def of_kind(self, kind: str) -> Iterator[tuple[str, Loan]]:
         """Yield the loans whose value can be read now, with their keys."""
@@ -233,13 +248,6 @@ def equal(a: Parameter, b: Parameter) -> bool:
     if a.unit and b.unit and a.unit != b.unit:
         second = float(convert(second, b.unit, a.unit))
     return abs(first - second) <= _ROUNDED * max(abs(first), abs(second))
-
-
-def amount_text(parameter: Parameter) -> str:
-    try:
-        return quantity(float(parameter.value or ""), parameter.unit or "")
-    except ValueError:
-        return parameter.value or "no value"
 
 
 def _matters(name: str, action: str) -> bool:

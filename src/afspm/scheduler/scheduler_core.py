@@ -88,7 +88,10 @@ def step(
     request_pipeline.send_next(draft)
     if draft.control is not state.control:
         _dispatch(draft, ControlChanged(state.control, draft.control))
+        if draft.control.mode is ControlMode.MANUAL is not state.control.mode:
+            lending.say_in_manual(draft)
     approvals.publish_changes(draft)
+    lending.publish_changes(draft)
     _end_when_safe(draft)
     return draft.finish()
 

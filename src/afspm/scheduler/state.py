@@ -303,5 +303,5 @@ def restored_state(
         ),
         grants=replace(state.grants, book=saved.grants),
         panel=saved.panel,
-        loans=LoanBook(saved.loans, lent_last=saved.lent_last),
+        loans=LoanBook.restored(saved.loans, saved.lent_last),
     )

@@ -290,6 +290,15 @@ SETTINGS = MessageMapping(
     settings=_each("settings", _SETTING),
     settle_s=FieldMapping("settle", from_wire=_wait),
 )
+_LOAN = MessageMapping(
+    model.LoanInForce,
+    loans_pb2.Loan,
+    value=FieldMapping("value", PARAMETER.to_wire, PARAMETER.from_wire),
+    base=FieldMapping("base", PARAMETER.to_wire, PARAMETER.from_wire),
+    lender="lender",
+    is_unsure=FieldMapping("unsure", sparse=True),
+    why=FieldMapping("reason", sparse=True),
+)
 _COUNT = MessageMapping(model.GrantedCount, grants_pb2.GrantedCount, "action", "count")
 _RANGE = MessageMapping(model.GrantedRange, grants_pb2.GrantedRange, "parameter", "low", "high")
 GRANT = MessageMapping(
@@ -404,6 +413,7 @@ MAPPINGS: tuple[MessageMapping[Any], ...] = (
     _NOTE,
     _SWEPT,
     SETTINGS,
+    MessageMapping(model.LoansInForce, loans_pb2.Loans, loans=_each("loans", _LOAN)),
     MessageMapping(
         model.InstrumentReadings,
         instruments_pb2.InstrumentReadings,

@@ -296,6 +296,14 @@ APPROVALS: Final = MessageDeclaration(
     event="approvals",
     in_past=True,
 )
+LOANS: Final = MessageDeclaration(
+    type=loans_pb2.Loans,
+    kind=MessageKind.EVENT,
+    source=Role.SCHEDULER,
+    always=False,
+    event="loans",
+    in_past=True,
+)
 PROPOSAL: Final = MessageDeclaration(
     type=grants_pb2.Proposal,
     kind=MessageKind.EVENT,

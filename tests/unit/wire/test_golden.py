@@ -34,6 +34,7 @@ AS_MODEL = {
     "InstrumentReadings",
     "Grant",
     "Approvals",
+    "Loans",
     "Proposal",
     "TipStatus",
     "ZCtrlUnits",

@@ -33,14 +33,17 @@ from afspm.model import (
     names,
 )
 from afspm.model.microscope_status import STOPS
+from afspm.model.requests import amount_text
 from afspm.model.setting_order import widening_first
-from afspm.scheduler.loans import SETTLES, LoanBook, amount_text, equal, key_of, kind_of, may_be_lent
+from afspm.scheduler.loans import SETTLES, LoanBook, equal, key_of, kind_of, may_be_lent
 from afspm.scheduler.publishing.event_log import SCHEDULER
+from afspm.scheduler.publishing.own_packets import publish
 from afspm.scheduler.requests import answers, approvals
 from afspm.scheduler.requests.forwarder import CompareForTurn, ForwardedRequest, ReadForTurn, SetForTurn
 from afspm.scheduler.requests.pending_requests import Lending, Turn, WayStep
 from afspm.scheduler.safety import present_state
 from afspm.scheduler.state import SchedulerState, StateDraft
+from afspm.wire.messages import LOANS
 
 MEASURES = frozenset((names.START_SCAN, names.START_SPEC, names.HOLD_Z, *names.TREATMENTS, *names.APPROACHES))
 """The actions that take place with what was stated for them, and with the base of all else."""
@@ -519,3 +522,24 @@ def due_s(state: SchedulerState | StateDraft) -> float | None:
     if is_to_return(book) and book.again_s:
         dues.append(book.again_s)
     return min(dues, default=None)
+
+
+def publish_changes(draft: StateDraft) -> None:
+    """Publish what is lent if it has changed, and no more changes are on their way."""
+    turn, book = draft.pending.turn, draft.loans
+    if book.loans is draft.before.loans.loans and book.shown is not None and turn is draft.before.pending.turn:
+        return
+    is_on_its_way = turn is not None and turn.lending is not None and not turn.lending.is_done
+    if is_on_its_way or book.in_force == book.shown or draft.barrier.until_s is not None:
+        return
+    draft.loans = replace(book, shown=book.in_force)
+    publish(draft, LOANS.name, draft.env.codec.encode(book.in_force))
+
+
+def say_in_manual(draft: StateDraft) -> None:
+    """Log what stays in force while a person has the microscope."""
+    for loan in draft.loans.loans.values():
+        value, base = (draft.limits.number(one) for one in (loan.value, loan.base))
+        is_small = loan.name == names.TIP_BIAS_VOLTAGE and value is not None and base is not None
+        level = "CRITICAL" if is_small and abs(value or 0.0) < 0.1 * abs(base or 0.0) else "WARNING"
+        draft.log(level, f"in force, and set back after `afspm continue` unless you set it: {loan.text}")
