@@ -372,7 +372,9 @@ def _on_frame_input(draft: StateDraft, event: Input) -> None:
 
 
 def _on_stopped(draft: StateDraft, event: Stopped) -> None:
-    # the run may be resumed: a tip in danger is then retracted, or a person is called; a person in control knows of it
+    # the run may be resumed: what is lent is then set back first
+    draft.loans = draft.loans.ended(draft.loans.loans)
+    # a tip in danger is then retracted, or a person is called; a person in control knows of it
     if draft.control.mode is ControlMode.MANUAL:
         return
     danger = draft.microscope.danger

@@ -23,6 +23,7 @@ from afspm.basics.progress_line import ProgressLine
 from afspm.components import notifications
 from afspm.components.notifications import END, GIVEN_UP, NotDelivered, Notification, Targets, Way
 from afspm.experiment import Role, implied_parts
+from afspm.model import LoansInForce
 from afspm.model.events import LOGGED_AS
 from afspm.night.run import open_run
 from afspm.record.journal import JOURNAL_FILE
@@ -32,6 +33,7 @@ from afspm.storage import log_folder
 from afspm.storage.disk import DiskTimeout, run_bounded
 from afspm.supervisor.supervision.run_end import EndReason
 from afspm.transport.process import signals
+from afspm.wire.messages import LOANS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -124,9 +126,13 @@ def _counts_of_record(folder: Path) -> list[str]:
         with open_run(folder) as run:
             whole = sum(not row.interrupted for row in run.scans)
             interrupted, spectra = len(run.scans) - whole, len(run.spectra)
+            lent = [thing.loans for _, _, thing in run.messages((LOANS.name,)) if isinstance(thing, LoansInForce)][-1:]
     except FileError:
         return []
-    return [_measured(whole, spectra) + (f"; {interrupted} interrupted" if interrupted else "")]
+    return [
+        _measured(whole, spectra) + (f"; {interrupted} interrupted" if interrupted else ""),
+        *(f"still in force, and set back when it goes on: {loan.text}" for loans in lent for loan in loans),
+    ]
 
 
 def _counts_of_table(table: Path) -> list[str]:
