@@ -299,6 +299,7 @@ class Scope(ExperimentView):
         order: SweepOrder = "snake",
         seed: int = 0,
         repeat: int = 1,
+        settle: float | str = 0.0,
         withdraw: bool | Sequence[str] = False,
         key: str | None = None,
         done: int = 0,
@@ -327,6 +328,7 @@ class Scope(ExperimentView):
                 over the values as listed, which may come again, as in a hysteresis loop; "random".
             seed: seed of the random order.
             repeat: number of points with the same values, one after the other.
+            settle: experiment time after a change of bias, setpoint or gains, in s or as text.
             withdraw: whether the tip is withdrawn while another instrument goes to its target. It then stays withdrawn
                 when the instruments are set back at the end. A list of actions moves the tip away besides, as a lateral
                 move of a stage needs it; then it is brought back by an `approach`.
@@ -353,7 +355,8 @@ class Scope(ExperimentView):
                 "a sweep measures nothing at its points", where="sweep", hint="list a region or position"
             )
         aside = None if not withdraw else () if withdraw is True else tuple(withdraw)
-        targets = [replace(one, aside=aside) for one in targets]
+        settle_s = si_or_text(settle, "s")
+        targets = [replace(one, aside=aside, settle_s=settle_s) for one in targets]
         key = key and check_key(key)
         of_others, of_microscope = partition(axis.name for axis in plan.axes)
         former = FormerTargets(of_others, key, self._link, self._control, self._commands, self._targets, self._results)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC
 from typing import Any, Literal
@@ -13,7 +13,7 @@ from afspm.basics import Angle, ControlLost, RequestError
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import ConfigError, InvalidValue, Refused, UnitError
 from afspm.basics.formatting import counted, day_and_time
-from afspm.basics.units import Length, Period, convert, si
+from afspm.basics.units import Duration, Length, Period, convert, si
 from afspm.client.component import Component
 from afspm.client.events import PublishedEvent
 from afspm.client.parameter_text import to_parameter
@@ -63,6 +63,8 @@ class PlannedScans(Component):
         end_when_done: whether to end the whole experiment after the last scan.
         parameters: the settings of each scan, e.g. {scan-speed = "2 um/s"}: set right before it, and set back for the
             measurements of other components.
+        settle: experiment time after a change of bias, setpoint or gains, before a scan begins; by default that of
+            [control].
         missed: treatment of scans that were due while control was lost (MANUAL, the repair of a tip). "extend": they
             are taken after the others, with the same period; "catch-up": at once, one after the other; "skip": never;
             "rest": as "extend", and of a scan that a `LineWatch` stopped only the rows since the change are taken.
@@ -88,10 +90,11 @@ class PlannedScans(Component):
         parameters: dict[str, str | float] | None = None,
         missed: Missed = "extend",
         retakes: int = 0,
+        settle: Duration | None = None,
     ) -> None:
         if retakes < 0:
             raise ConfigError(f"{retakes} retakes", where="retakes", hint="0 or more")
-        self.retakes = retakes
+        self.retakes, self.settle = retakes, settle
         self.keep_control, self.end_when_done, self.missed = keep_control, end_when_done, missed
         self.parameters = checked_parameters(parameters, "parameters")
         self.needs_parameters = (*FRAME, *self.parameters)
@@ -118,7 +121,7 @@ class PlannedScans(Component):
         self._retakes = Retakes(self.retakes, self.memory)
         self._refused = RefusedPlaces(len(self.plan.regions), self.memory)
         self._verdicts = self.scope.events(tip_verdict.MESSAGE) if self.retakes else None
-        with self.scope.control() if self.keep_control else nullcontext(), self.scope.settings(self.parameters):
+        with self.scope.control() if self.keep_control else nullcontext(), self._carried():
             for step in self.plan.steps(done):
                 if not self._await(step, rhythm):
                     break
@@ -136,6 +139,9 @@ class PlannedScans(Component):
         self.log.info("%s taken%s", taken, f"; the time of {left_out} had passed" if left_out else "")
         if self.end_when_done:
             self.scope.end_experiment()
+
+    def _carried(self) -> AbstractContextManager[None]:
+        return self.scope.settings(self.parameters, settle=self.settle)
 
     def _await(self, step: PlanStep, rhythm: RoundSchedule) -> bool:
         if not step.starts_round or self.memory.get("begun") == step.index:

@@ -12,7 +12,7 @@ from afspm.basics import Angle
 from afspm.basics.errors import ConfigError, InvalidValue, UnitError
 from afspm.basics.formatting import quantity
 from afspm.basics.plain_data import Plain
-from afspm.basics.units import Length
+from afspm.basics.units import Duration, Length
 from afspm.client.component import Component
 from afspm.client.sweeping import Measure
 from afspm.components.pace import Pace
@@ -71,6 +71,7 @@ class Sweep(Component):
             the values as listed, which may come again, as in a hysteresis loop; "random": shuffled by `seed`.
         seed: seed of the random order.
         repeat: number of points with the same values, one after the other.
+        settle: experiment time after a change of bias, setpoint or gains, before the measurement begins.
         withdraw: whether the tip is withdrawn while another instrument, such as a cryostat, goes to its target. At the
             end it then stays withdrawn. A list of actions, such as ["COARSE_OUT"], moves the tip away besides, as a
             lateral move of a stage needs it; then it is brought back by an approach.
@@ -94,6 +95,7 @@ class Sweep(Component):
         order: SweepOrder = "snake",
         seed: int = 0,
         repeat: int = 1,
+        settle: Duration = 0.0,
         withdraw: bool | list[str] = False,
         size: tuple[Length, Length] | None = None,
         center: tuple[Length, Length] | None = None,
@@ -111,6 +113,7 @@ class Sweep(Component):
         self.kind = kind
         self._given: Plain = {
             "parameters": parameters, "order": order, "seed": seed, "repeat": repeat, "withdraw": withdraw,
+            "settle": settle,
         }  # fmt: skip
         of_scans = {"size": size, "center": center, "angle": angle, "pixels": pixels, "regions": regions}
         of_spectra = {"at": at, "positions": positions, "grid": grid, "kind": kind, "curve": curve}

@@ -14,6 +14,8 @@ from afspm import wire
 from afspm.basics.errors import InvalidValue, Refused
 from afspm.client.scope import Scope
 from afspm.model import (
+    LEND_REQUEST,
+    RETURN_REQUEST,
     ControlRequest,
     ControlResponse,
     MeasurementConditions,
@@ -22,6 +24,7 @@ from afspm.model import (
     Region,
     Request,
     Response,
+    ResponseDetail,
     ScopeState,
     Settings,
     Spectrum,
@@ -526,3 +529,77 @@ def test_killed_at_any_step_a_sweep_at_a_place_has_one_result_and_is_set_back() 
 def test_sweep_at_a_place_without_sense_is_refused(given: dict[str, Any], why: str) -> None:
     with pytest.raises(InvalidValue, match=why):
         scope_of(EsrLab()).sweep_at(**({"parameter": "source.bias", "values": VOLTS, "read": ["lockin.x"]} | given))
+
+
+# reports B4
+def test_settling_time_is_stated_with_each_point_and_block() -> None:
+    lab = SweepLab()
+    scope = scope_of(lab)
+    with scope.sweep(TWO_POINTS, shape=(8, 8), settle="2 s") as points:
+        list(points)
+    with scope.settings({"zctrl-igain": 3}, settle="500 ms"), scope.settings({"tip-bias-voltage": "1 V"}):
+        scope.scan(shape=(8, 8))
+    assert [one.subject.settle_s for one in lab.requests if one.kind == LEND_REQUEST] == [2.0, 2.0, 0.5]
+
+
+def test_blocks_hold_together_and_the_inner_one_comes_first() -> None:
+    lab = SweepLab()
+    scope = scope_of(lab)
+    with scope.settings({"zctrl-igain": 3, "tip-bias-voltage": "0.2 V"}):
+        for _ in range(3):
+            with scope.settings({"tip-bias-voltage": "0.3 V"}):
+                scope.scan(shape=(8, 8))
+        scope.scan(shape=(8, 8), settings={"zctrl-igain": 4})
+        scope.scan(shape=(8, 8))
+    assert lab.measured == [*[("0.3", "3")] * 3, ("0.2", "4"), ("0.2", "3")]
+    assert lab.in_force == BEFORE
+    returned = [tuple(p.name for p in one.subject.parameters) for one in lab.requests if one.kind == RETURN_REQUEST]
+    assert returned == [("tip-bias-voltage", "zctrl-igain")], "what an outer block states is not given back"
+
+
+def test_setting_of_another_instrument_is_no_setting_of_a_measurement() -> None:
+    with pytest.raises(InvalidValue, match=r"cryo\.temperature belongs to another instrument"):
+        scope_of(SweepLab()).scan(settings={"cryo.temperature": "4 K"})
+
+
+def test_key_of_a_scan_with_other_settings_is_refused_and_those_of_a_block_are_free(tmp_path: Path) -> None:
+    lab = SweepLab()
+    scope = scope_of(lab, tmp_path)
+    scope.scan(shape=(8, 8), key="one", settings={"zctrl-igain": 3})
+    with pytest.raises(InvalidValue, match="was used for another measurement"):
+        scope.scan(shape=(8, 8), key="one", settings={"zctrl-igain": 4})
+    with scope.settings({"tip-bias-voltage": "1 V"}):
+        scope.scan(shape=(8, 8), key="one", settings={"zctrl-igain": 3})
+    assert len(lab.measured) == 1
+
+
+def test_settings_are_stated_again_when_they_are_not_in_force_any_more() -> None:
+    lab = SweepLab()
+    refused: list[str] = []
+
+    def once(request: Request) -> Response | str:
+        if request.subject != names.START_SCAN or refused:
+            return "go on"
+        refused.append(request.id)
+        detail = ResponseDetail.STATE_AGAIN
+        return Response(ControlResponse.NOT_FREE, reason="the bias was 0.7 V", id=request.id, detail=detail)
+
+    lab.intercept = once
+    scope_of(lab).scan(shape=(8, 8), settings={"tip-bias-voltage": "0.2 V"})
+    assert lab.count(LEND_REQUEST) == 2
+    assert lab.measured == [("0.2", "7")]
+    assert lab.clock.passed_s < SCAN_S + 10.0, "at once"
+
+
+def test_what_was_stated_for_a_measurement_that_did_not_begin_does_not_hold_for_the_next() -> None:
+    lab = SweepLab()
+    lab.intercept = lambda request: (
+        Response(ControlResponse.ACTION_ERROR, reason="no tip") if request.subject == names.START_SCAN else "go on"
+    )
+    scope = scope_of(lab)
+    with scope.control():
+        with pytest.raises(Refused):
+            scope.scan(shape=(8, 8), settings={"tip-bias-voltage": "0.2 V"})
+        lab.intercept = lambda request: "go on"
+        scope.scan(shape=(8, 8))
+    assert [len(one.subject.settings) for one in lab.requests if one.kind == LEND_REQUEST] == [1, 0]
