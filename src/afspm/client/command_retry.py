@@ -73,7 +73,7 @@ class CommandRetry:
     Attributes:
         may_have_lent: whether the scheduler may have something to set back.
         states: whether something was stated since the last measurement began.
-        decided: parameters that can't be lent: they stay as they were set.
+        decided: parameters that can't be lent, and stay as they were set, with the values before; None: unknown.
     """
 
     def __init__(self, link: ExperimentLink, control: ControlHold) -> None:
@@ -84,7 +84,7 @@ class CommandRetry:
         self._lends = True
         self.may_have_lent = True
         self.states = False
-        self.decided: set[str] = set()
+        self.decided: dict[str, Parameter | None] = {}
 
     def ask(self, kind: int, subject: object = None, *, until_s: float | None = None) -> Response:
         """Send a command until it succeeds, inside a block with control; after a loss of control, wait to regain it.
@@ -180,7 +180,9 @@ class CommandRetry:
             else:
                 found: Settings = wire.decode(LENT_SETTINGS.name, response.payload)
                 self.may_have_lent, self.states = True, bool(wanted)
-                self.decided |= {one.parameter.name for one in found.settings if one.is_lent is False}
+                for one in found.settings:
+                    if one.is_lent is False:
+                        self.decided.setdefault(one.parameter.name, one.known[0] if one.known else None)
                 return {one.name: one for one in found.parameters}
         return {one.name: self.set_parameter(one, until_s) for one in wanted}
 

@@ -1,23 +1,27 @@
-"""The targets of other instruments before a sweep, and their way back."""
+"""The values before a sweep that the scheduler does not set back, and their way back."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from afspm import wire
 from afspm.basics.errors import Refused
-from afspm.client.command_retry import CommandRetry
+from afspm.client.command_retry import CommandRetry, refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.instrument_targets import InstrumentTargets
 from afspm.client.keyed_results import KeyedResults
-from afspm.model import Parameter, is_of_instrument
+from afspm.client.measurement_setup import PLACES
+from afspm.model import ControlRequest, Parameter, is_of_instrument
 
 
 class FormerTargets:
-    """The targets of other instruments before a sweep, to be set at its end; nothing waits until they have arrived.
+    """The values of swept parameters that can't be lent, as they were before, to be set at the end of a sweep.
+
+    These are targets of other instruments, for which nothing waits then, places, and what changes other numbers.
 
     Args:
-        names: the parameters.
+        names: the swept parameters.
         key: name of the plan; the targets are then saved on disk, and set even after a restart of the component.
     """
 
@@ -38,9 +42,29 @@ class FormerTargets:
         self._before = None if key is None else results.before_sweep(key)
 
     def remember(self, until_s: float | None) -> None:
-        """Read the targets, once. Control must be held."""
-        if self._before is None and self._names:
-            self._keep([self._targets.in_force(name, until_s) for name in self._names])
+        """Read the targets and places, once. Control must be held."""
+        if self._before is None:
+            for name in self._names:  # of an earlier sweep
+                self._commands.decided.pop(name, None)
+            self._keep(
+                [self._in_force(name, until_s) for name in self._names if is_of_instrument(name) or name in PLACES]
+            )
+
+    def add_decided(self) -> None:
+        """Remember the values before those that the scheduler has set, and does not lend."""
+        known = {one.name for one in self._before or ()}
+        of_scheduler = self._commands.decided
+        new = [before for name in self._names if name not in known and (before := of_scheduler.get(name)) is not None]
+        if new:
+            self._keep([*(self._before or ()), *new])
+
+    def _in_force(self, name: str, until_s: float | None) -> Parameter:
+        if is_of_instrument(name):
+            return self._targets.in_force(name, until_s)
+        response = self._commands.read(ControlRequest.PARAM, Parameter(name), until_s)
+        if not response.ok:
+            raise refused(ControlRequest.PARAM, response, name)
+        return wire.decode_parameter(response.payload)
 
     def set_back(self, until_s: float | None) -> None:
         """Set the former targets; one that the instrument refuses is logged.
@@ -49,7 +73,7 @@ class FormerTargets:
             ControlLost, NoResponse: they are not set by `until_s`. A later call can still do so, with a key even after
                 a restart.
         """
-        if self._before is None:
+        if not self._before:
             return
         is_back = True
         with self._control.hold(until_s=until_s):

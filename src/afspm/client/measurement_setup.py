@@ -20,6 +20,10 @@ from afspm.model import (
     is_of_instrument,
     names,
 )
+from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES
+
+PLACES = frozenset((*REGION_CHANGES, *PROBE_CHANGES, *SHAPE_CHANGES))
+"""Parameters that say where to measure."""
 
 
 class MeasurementSetup:
@@ -107,9 +111,13 @@ class MeasurementSetup:
         decided = self._commands.decided
         of_block = () if self.holds_z else tuple(one for one in of_block if one.name not in decided)
         wanted = {one.name: one for one in (*of_block, *own) if not is_of_instrument(one.name)}
+        # where to measure is mapped onto the sample, and others set it for their own measurements
+        places = {name: self._commands.set_parameter(one, until_s) for name, one in wanted.items() if name in PLACES}
+        wanted = {name: one for name, one in wanted.items() if name not in places}
         # what was stated for a measurement that did not begin must not hold for this one
         is_needed = bool(wanted) or (self._commands.states and not self.holds_z)
-        return self._commands.lend(tuple(wanted.values()), until_s, settle_s) if is_needed else {}
+        lent = self._commands.lend(tuple(wanted.values()), until_s, settle_s) if is_needed else {}
+        return {**places, **lent}
 
     def move_probe(self, xy_m: XY, until_s: float | None, *, drifts: bool = False) -> None:
         """Move the probe to (x, y) in m, unless it is there already.

@@ -359,7 +359,8 @@ class Scope(ExperimentView):
         targets = [replace(one, aside=aside, settle_s=settle_s) for one in targets]
         key = key and check_key(key)
         of_others, of_microscope = partition(axis.name for axis in plan.axes)
-        former = FormerTargets(of_others, key, self._link, self._control, self._commands, self._targets, self._results)
+        swept = [*of_others, *of_microscope]
+        former = FormerTargets(swept, key, self._link, self._control, self._commands, self._targets, self._results)
         sweep = ParameterSweep(plan, targets, key, former, runner=self._runner, results=self._results)
         until_s = self._link.until(timeout_s)
         # others would measure at a swept temperature
@@ -413,8 +414,10 @@ class Scope(ExperimentView):
         target = SpectrumTarget.of(at, kind or parameter, self._frame)
         sweep = PlacedSweep(axis, names, target, si_or_text(settle, "s"))
         key = key and check_key(key)
-        of_others, of_microscope = partition([parameter])
-        former = FormerTargets(of_others, key, self._link, self._control, self._commands, self._targets, self._results)
+        _, of_microscope = partition([parameter])
+        former = FormerTargets(
+            [parameter], key, self._link, self._control, self._commands, self._targets, self._results
+        )
         sweeper = PlacedSweeper(self._link, self._control, self._commands, self._targets, self._setup, self._results)
         with self._call():
             until_s = self._link.until(timeout_s)

@@ -95,6 +95,7 @@ class ParameterSweep:
             if result is None:
                 self._former.remember(until_s)
                 result = self._runner.take(target, key, until_s)
+                self._former.add_decided()
             in_force = _shown(self._plan, result.conditions)
             values = self._plan.values(places)
             yield SweepPoint(index + 1, len(each), point, key or "", values, in_force, result)

@@ -98,6 +98,7 @@ class PlacedSweeper:
                 with self._control.hold(until_s=until_s, unbroken=True):
                     former.remember(until_s)
                     spectrum, conditions = self._measure(sweep, until_s)
+                    former.add_decided()
                 break
             except ControlLost as lost:
                 self._control.regain(until_s)

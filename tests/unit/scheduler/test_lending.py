@@ -631,10 +631,20 @@ def test_parameter_that_the_microscope_lacks_is_refused() -> None:
 def test_parameter_that_may_not_be_lent_stays_as_it_is_set() -> None:
     desk = Desk()
     desk.panel["x-mode"] = "fast"
-    desk.measures("a", x_mode="slow")
+    desk.take_control("a")
+    (answered,) = desk.codec.decode(desk.lends("a", x_mode="slow").payload).settings
+    assert answered == Setting(Parameter("x-mode", "slow"), (Parameter("x-mode", "fast"),), is_lent=False)
+    desk.asked("a", ACTION, names.START_SCAN)
+    desk.says("a", ControlRequest.RELEASE_CTRL)
     desk.measures("c")
     assert desk.panel["x-mode"] == "slow"
     assert desk.loans == {}
+
+
+def test_place_is_no_setting_of_a_measurement() -> None:
+    desk = Desk()
+    desk.take_control("a")
+    assert "scan-size-x says where to measure" in desk.lends("a", scan_size_x="100 nm").reason
 
 
 # --- curves ---
@@ -715,9 +725,6 @@ def test_nothing_is_lent_or_set_back_while_z_is_held() -> None:
     desk.scope_is(ScopeState.FREE)
     desk.serve()
     assert desk.panel[BIAS] == 0.1
-
-
-# --- the second electrode ---
 
 
 # --- waits ---

@@ -33,6 +33,7 @@ from afspm.model import (
     names,
 )
 from afspm.model.microscope_status import STOPS
+from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES
 from afspm.model.requests import amount_text
 from afspm.model.setting_order import widening_first
 from afspm.scheduler.loans import SETTLES, LoanBook, equal, key_of, kind_of, may_be_lent
@@ -47,6 +48,7 @@ from afspm.wire.messages import LOANS
 
 MEASURES = frozenset((names.START_SCAN, names.START_SPEC, names.HOLD_Z, *names.TREATMENTS, *names.APPROACHES))
 """The actions that take place with what was stated for them, and with the base of all else."""
+_PLACES = frozenset((*REGION_CHANGES, *PROBE_CHANGES, *SHAPE_CHANGES))
 _AGAIN_S = 5.0  # real, after a return that could not be made
 COMPARED = "all that the turn compares"
 """The name under which a turn awaits the values in force."""
@@ -127,6 +129,10 @@ def _begin(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> None:
         return
     if job.request.kind == RETURN_REQUEST and not may_return(draft):
         _finish(draft, job, Lending())
+        return
+    if place := next((one.name for one in _stated(job) if one.name in _PLACES), ""):
+        why = f"{place} says where to measure, and is no setting of a measurement: set it before"
+        _refuse(draft, job, Response(int(ControlResponse.PARAM_ERROR), b"", why, job.request.id))
         return
     draft.loans = draft.loans.used(draft.now_ns)
     asked = _to_compare(draft, job)
@@ -421,8 +427,8 @@ def _finish(draft: StateDraft, job: ForwardedRequest, lending: Lending) -> None:
         in_force = {one.name: lending.now.get(one.name, one) for one in stated}
         token = draft.peers.sessions.token(job.client)
         draft.loans = draft.loans.stating(job.client, token, {key_of(one.name, lending.kind): one for one in stated})
-        given = Settings.of(*(in_force[one.name] for one in _stated(job)))
-        payload = draft.env.codec.encode(given)
+        given = (_answered(lending, in_force[one.name]) for one in _stated(job))
+        payload = draft.env.codec.encode(Settings(tuple(given)))
         if job.client == draft.control.holder:
             draft.lease = draft.lease.commanded(draft.now_ns, draft.now_s)
     elif job.request.kind == RETURN_REQUEST:
@@ -433,6 +439,14 @@ def _finish(draft: StateDraft, job: ForwardedRequest, lending: Lending) -> None:
         answers.answer_unsent(draft, job, lending.later)
     else:
         answers.finish(draft, job, Response(int(ControlResponse.SUCCESS), payload, "", job.request.id))
+
+
+def _answered(lending: Lending, in_force: Parameter) -> Setting:
+    # of a value that is not lent, the client learns the one before
+    found = lending.compared.get(in_force.name)
+    if found is None or may_be_lent(found):
+        return Setting(in_force)
+    return Setting(in_force, (found.parameter,), is_lent=False)
 
 
 def _try_again_later(draft: StateDraft) -> None:
