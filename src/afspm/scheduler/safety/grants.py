@@ -22,7 +22,9 @@ from afspm.basics.frozen import replace
 from afspm.model import (
     CLOCK_REQUEST,
     LEASE_REQUEST,
+    LEND_REQUEST,
     RELAY_REQUEST,
+    RETURN_REQUEST,
     Approval,
     Approvals,
     ControlRequest,
@@ -78,7 +80,9 @@ _COMMANDS = frozenset(
         ),
     )
 )
-_ALWAYS = frozenset({int(ControlRequest.ACTION_SUPPORT), int(ControlRequest.RELEASE_CTRL), CLOCK_REQUEST})
+_ALWAYS = frozenset(
+    {int(ControlRequest.ACTION_SUPPORT), int(ControlRequest.RELEASE_CTRL), CLOCK_REQUEST, RETURN_REQUEST}
+)
 
 
 @dataclass(frozen=True)
@@ -343,7 +347,7 @@ class GrantChecker:
         if kind == LEASE_REQUEST:
             is_short = isinstance(subject, float) and subject <= LONGEST_AGENT_LEASE_S
             return "" if is_short else f"the lease of an agent is at most {LONGEST_AGENT_LEASE_S:g} s"
-        if kind not in _COMMANDS and kind != ControlRequest.REQUEST_CTRL:
+        if kind not in _COMMANDS and kind not in (ControlRequest.REQUEST_CTRL, LEND_REQUEST):
             return f"{who} is an agent: only a person may do this"
         if kind == ControlRequest.REQUEST_CTRL and subject:
             return f"{who} is an agent: it solves no problems"
