@@ -13,7 +13,7 @@ from typing import Final
 
 from control_transfer import control_transfer
 from message_drawings import message_bytes, two_paths
-from sheet import BAD, CONTROL, DATA, GREY, INK, QUIET, Sheet
+from sheet import BAD, CONTROL, DATA, GOOD, GREY, INK, QUIET, Sheet
 
 FOLDER: Final = Path(__file__).resolve().parents[1] / "docs" / "pictures"
 
@@ -274,6 +274,49 @@ def house() -> str:
     return sheet.document(740, 440, "The rooms of the core and the guests")
 
 
+_VOLT_Y = {1.0: 168, 0.5: 222, 0.3: 248, 0.1: 274}
+_PLANNED = (("a", 96, 0.5), ("b", 186, 1.0), ("a", 276, 0.5), ("c", 366, 0.1), ("c", 480, 0.3), ("a", 570, 0.5))
+
+
+def settings_over_a_base() -> str:
+    """Two plans that state a bias, one that states none, and the bias in force before, in and after their scans."""
+    sheet = Sheet()
+    lanes = {"a": (40, "component", DATA), "b": (70, "translator", CONTROL), "c": (100, "controller", GREY)}
+    kinds = {"a": "translator", "b": "scheduler", "c": "controller"}
+    for name, text in (("a", "plan a: 0.5 V"), ("b", "plan b: 1 V"), ("c", "plan c: no bias")):
+        sheet.note((8, lanes[name][0] + 4), text, anchor="start")
+    for name, x, _ in _PLANNED:
+        sheet.box((x + 35 + 20, lanes[name][0]), (66, 22), kinds[name], "scan", bold=False)
+    # the base, then the value in force over it
+    sheet.svg.line([(100, _VOLT_Y[0.1]), (468, _VOLT_Y[0.1])], stroke=GOOD, end=False, dashed=True)
+    sheet.svg.line([(468, _VOLT_Y[0.3]), (708, _VOLT_Y[0.3])], stroke=GOOD, end=False, dashed=True)
+    way, now = [(100.0, float(_VOLT_Y[0.1]))], 0.1
+    for _, x, value in (*_PLANNED[:4], ("person", 452, 0.3), *_PLANNED[5:], ("end", 648, 0.3)):
+        at = x + 16
+        if value != now:
+            way += [(at, _VOLT_Y[now]), (at, _VOLT_Y[value])]
+            now = value
+    sheet.svg.line([*way, (708, _VOLT_Y[now])], stroke=INK, end=False)
+    for volt, text in ((1.0, "1 V"), (0.5, "0.5 V"), (0.1, "0.1 V")):
+        sheet.note((92, _VOLT_Y[volt] + 4), text, anchor="end", fill=QUIET)
+    sheet.note((8, 140), "bias in force", anchor="start", bold=True)
+    notes = (
+        (112, 206, "set right before", INK),
+        (202, 158, "switched directly", INK),
+        (382, 256, "set back", INK),
+        (468, 236, "a decision: 0.3 V", CONTROL),
+        (664, 212, "end: set back", INK),
+    )
+    for x, y, text, fill in notes:
+        anchor = "end" if x == 664 else "start"
+        sheet.svg.text(x + (4 if anchor == "start" else 40), y, text, size=11, fill=fill, anchor=anchor, halo=True)
+    sheet.note((104, 292), "base: 0.1 V", anchor="start", fill=GOOD)
+    sheet.note((474, 266), "base: 0.3 V", anchor="start", fill=GOOD)
+    sheet.arrow((100, 310), (708, 310))
+    sheet.note((708, 326), "time", anchor="end", fill=QUIET)
+    return sheet.document(720, 334, "The bias of two plans that alternate over a base, and of a plan without one")
+
+
 DRAWINGS: dict[str, Callable[[], str]] = {
     "house": house,
     "one-and-two-computers": computers,
@@ -285,6 +328,7 @@ DRAWINGS: dict[str, Callable[[], str]] = {
     "two-paths": two_paths,
     "message-bytes": message_bytes,
     "control-transfer": control_transfer,
+    "settings-over-a-base": settings_over_a_base,
 }
 
 

@@ -114,6 +114,11 @@ class PublishedState:
         """Store the conditions of a measurement, which are published right before it."""
         self._conditions.append(conditions)
 
+    def conditions_of(self, result: Scan | Spectrum | None) -> MeasurementConditions | None:
+        """Return the conditions of a result, or of the newest one; None if they are not known (any more)."""
+        of_it = (one for one in reversed(self._conditions) if result is None or one.is_of(result))
+        return next(of_it, None)
+
     def described(self, thing: Any) -> Any:
         """Return a scan, lines of one, or a curve with the roles of what it measures; any other thing unchanged.
 
@@ -122,7 +127,7 @@ class PublishedState:
         shown = self.channels.shown(thing) if isinstance(thing, Scan | ScanLines | Spectrum) else thing
         if not isinstance(shown, Scan | Spectrum):
             return shown
-        of_it = next((one for one in reversed(self._conditions) if one.is_of(shown)), None)
+        of_it = self.conditions_of(shown)
         shown = shown if of_it is None else replace(shown, in_force=of_it.in_force)
         return replace(shown, simulated=True) if self.simulated and isinstance(shown, Scan) else shown
 

@@ -18,10 +18,12 @@ from afspm.model import (
     Feedback,
     ProbePosition,
     ProblemNames,
+    Scan,
     ScanParameters,
     ScopeState,
     TipStatus,
 )
+from afspm.model.caption import in_force, settings_to_lend
 from afspm.model.state import FeedbackUnits
 from afspm.transport.process.parent import StopRequested
 
@@ -111,6 +113,19 @@ class ExperimentView:
         """Return the units of the numbers of `feedback`; empty where the microscope has not published them."""
         self._catch_up()
         return self._link.view.feedback_units
+
+    def settings_of(self, scan: Scan | None = None) -> dict[str, str]:
+        """Return the bias, setpoint, speed and gains that a scan has stated, as `settings` of one to compare with it.
+
+        Args:
+            scan: None: the newest measurement.
+
+        Returns:
+            Empty if it has stated none, or its conditions are not known any more.
+        """
+        self._catch_up()
+        found = self._link.view.conditions_of(scan)
+        return {} if found is None else settings_to_lend(in_force(found.begin_values, found.end_values))
 
     @property
     def tip(self) -> TipStatus | None:

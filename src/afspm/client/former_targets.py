@@ -51,7 +51,7 @@ class FormerTargets:
             )
 
     def add_decided(self) -> None:
-        """Remember the values before those that the scheduler has set, and does not lend."""
+        """Remember the former values of parameters that the scheduler has set, and does not lend."""
         known = {one.name for one in self._before or ()}
         of_scheduler = self._commands.decided
         new = [before for name in self._names if name not in known and (before := of_scheduler.get(name)) is not None]

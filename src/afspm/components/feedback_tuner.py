@@ -24,9 +24,9 @@ class FeedbackTuner(FeedbackObserver):
     no gain is good, the component restores the original gain, says so at CRITICAL, and clears the flag, so that the
     experiment continues as before. The same happens if the signal stays at one distance from the setpoint while the
     height follows: then the setpoint and the channel are calibrated differently, which no gain changes. Each test scan
-    carries its gain, so that the original one is set back after a failed scan, a loss of control or a kill; a good gain
-    of the search is set as soon as possible. If a gain can't be set again, the component flags `device-malfunction`, so
-    that nothing is scanned until a person has set one.
+    carries its gain, beside the settings of the scan that was found bad, so that the original one is set back after a
+    failed scan, a loss of control or a kill; a good gain of the search is set as soon as possible. If a gain can't be
+    set again, the component flags `device-malfunction`, so that nothing is scanned until a person has set one.
 
     `afspm check` compares the bounds with those of the microscope and of `[limits]`, so that no gain beyond is set.
 
@@ -86,20 +86,22 @@ class FeedbackTuner(FeedbackObserver):
         if feedback is None or feedback.integral_gain is None or feedback.on is False:
             self._finish(f"the feedback in force is {feedback}")
             return
-        before, self._way = feedback.integral_gain, [feedback.integral_gain]
+        before, self._way = self._in_force(), [feedback.integral_gain]
         self.memory["before"] = before
-        start, why = min(max(before, self.lowest), self.highest), ""
+        settings = self.scope.settings_of()  # of the scan that was found bad, whose gain may be its plan's
+        gain = float(settings.get(names.ZCTRL_IGAIN, f"{before:g}").split()[0])
+        start, why = min(max(gain, self.lowest), self.highest), ""
         try:
             # each scan has a gain of its own; the scheduler sets the former one back
-            with self.scope.settings({names.ZCTRL_IGAIN: start}):
+            with self.scope.settings({**settings, names.ZCTRL_IGAIN: start}):
                 if self._search(start) is None:
                     why = f"no gain is good from {self.lowest:g} to {self.highest:g}"
                 elif not self._set_found():
                     return
         except InvalidValue as error:
             why = error.what
-        if why and not math.isclose(gain := self._in_force(), before, rel_tol=_ROUNDED):
-            self._call_a_person(before, gain, "the log of the scheduler says why")
+        if why and not math.isclose(now := self._in_force(), before, rel_tol=_ROUNDED):
+            self._call_a_person(before, now, "the log of the scheduler says why")
             return
         self._finish(why)
 

@@ -63,7 +63,7 @@ class PlannedScans(Component):
         end_when_done: whether to end the whole experiment after the last scan.
         parameters: the settings of each scan, e.g. {scan-speed = "2 um/s"}: set right before it, and set back for the
             measurements of other components.
-        settle: experiment time after a change of bias, setpoint or gains, before a scan begins; by default that of
+        settle: experiment time after a change of bias, setpoint or gains, before a scan begins; by default as in
             [control].
         missed: treatment of scans that were due while control was lost (MANUAL, the repair of a tip). "extend": they
             are taken after the others, with the same period; "catch-up": at once, one after the other; "skip": never;

@@ -83,8 +83,8 @@ class Survey(Component):
         targets: a function of yours that finds targets instead of particles, e.g. "my_module.corners": it gets the
             `Scan`, and returns positions (x, y) in metres, the best first.
         refine: whether to find the target again in its zoom, so that curves are taken at its place there.
-        parameters: parameters to set before the survey, e.g. {scan-speed = "10 um/s"}.
-        zoom_parameters: parameters to set before the zooms.
+        parameters: the settings of all scans and curves, e.g. {scan-speed = "10 um/s"}.
+        zoom_parameters: the settings of zooms and curves, which come before `parameters`.
         keep_control: whether to keep control between measurements; by default others may measure meanwhile.
         end_when_done: whether to end the whole experiment after the last target.
         file: name of the table and of the picture in the run folder, without suffix.

@@ -54,9 +54,10 @@ class ListedGrid:
 class Sweep(Component):
     """Scans and spectra at each combination of the values of some parameters.
 
-    At the end the parameters are set back to their values before the sweep, also after a kill and restart. A restart
-    repeats no point. Control is kept over the whole sweep; a point that was interrupted, by the repair of a tip for
-    instance, is measured again with its parameters set again.
+    Each measurement carries the values of its point, and others may measure between two points with their own. At the
+    end the parameters have their values of before the sweep, also after a kill and restart. A restart repeats no point;
+    a point that was interrupted, by the repair of a tip for instance, is measured again. A sweep over a parameter of
+    another instrument keeps control over all its points.
 
     The keys of its measurements are `sweep-1`, `sweep-2` …, in the order of measurement, and the swept parameters are
     columns of `run.scans` and `run.spectra`. The report shows the scans beside each other in `sweep.png`.

@@ -23,7 +23,7 @@ from afspm.components.tip_treatments import Treatment, TreatmentPlaces, treatmen
 from afspm.components.tip_verdict import read_verdict
 from afspm.components.tip_workshop import DONE_ACTION, TipWorkshop
 from afspm.model import HEIGHT, HEIGHT_RETRACE, ChannelName, Problem, Region, Scan, ScanSet, names
-from afspm.model.caption import picture_settings, settings_to_lend
+from afspm.model.caption import picture_settings
 
 Frame = list[Any]
 """Region, pixels and settings in JSON's types: centre, size and angle; rows and columns; values to lend, by parameter.
@@ -152,7 +152,7 @@ class TipCorrector(Component):
             problems = self.scope.control_state.problems
             for event in events:
                 if isinstance(event.message, Scan):
-                    self._settings = settings_to_lend(event.message.in_force)
+                    self._settings = self.scope.settings_of(event.message)
                     frames[event.message.time_ns] = [
                         *_packed(event.message.region, event.message.shape),
                         self._settings,

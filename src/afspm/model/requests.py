@@ -144,7 +144,8 @@ class Setting:
 
     Attributes:
         parameter: to lend: with its value; to return or compare: without; in an answer: the value in force.
-        known: to compare: values that may be in force; in the answer those that are, within the controller's precision.
+        known: to compare: values that may be in force; in the answer the ones in force, within the controller's
+            precision.
         is_claimed: whether the next measurement stands for the first of `known`, if that is in force.
         is_lent: in an answer, whether the parameter may be lent; None: unknown to the translator.
     """

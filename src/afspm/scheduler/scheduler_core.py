@@ -372,7 +372,7 @@ def _on_frame_input(draft: StateDraft, event: Input) -> None:
 
 
 def _on_stopped(draft: StateDraft, event: Stopped) -> None:
-    # the run may be resumed: what is lent is then set back first
+    # the run may be resumed: its loans are then set back first
     draft.loans = draft.loans.ended(draft.loans.loans)
     # a tip in danger is then retracted, or a person is called; a person in control knows of it
     if draft.control.mode is ControlMode.MANUAL:

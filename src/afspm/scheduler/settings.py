@@ -60,7 +60,7 @@ class ControlSettings:
         request_timeout_s: real time after which a request counts as unanswered.
         request_retries: how often an unanswered request is sent again; it is never executed twice.
         settle_s: experiment time after a change of bias, setpoint or gains with the tip at the sample, before a
-            measurement begins that states other settings than the one before.
+            measurement begins.
         return_after_s: experiment time for which the microscope may be free until settings of a measurement are set
             back to the values of before.
         adjustable: parameters that a person sets in AUTOMATED as well, beside the component in control, while no

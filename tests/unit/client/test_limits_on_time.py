@@ -88,9 +88,9 @@ def test_sweep_waits_for_a_rate_and_sets_back() -> None:
 
 @pytest.mark.parametrize("swept", [names.MOVE_SPEED, names.SCAN_SIZE_X])
 def test_sweep_of_what_can_not_be_lent_sets_it_back_at_its_end(swept: str) -> None:
-    unit, what = (" m/s", {"size": SIZE}) if swept == names.MOVE_SPEED else (" m", {})
-    values = [f"{value}e-6{unit}" for value in (2, 3, 4)]
-    bench = Bench(Sweep(parameters={swept: values}, pixels=(8, 8), end_when_done=False, **what))
+    unit, size = (" m/s", SIZE) if swept == names.MOVE_SPEED else (" m", None)
+    values: list[str | float | bool] = [f"{value}e-6{unit}" for value in (2, 3, 4)]
+    bench = Bench(Sweep(parameters={swept: values}, pixels=(8, 8), size=size))
     bench.run(until="1 h")
     assert bench.is_done
     sets = [float(one.value) for one in entries(bench) if one.subject == swept and one.response == 0]

@@ -216,7 +216,7 @@ def test_plan_alone_sets_once_and_saves_no_more_than_before() -> None:
 
 
 @pytest.mark.parametrize("limit", [Limit(interval_s=300.0), Limit(rate_per_s=0.01, unit="V"), Limit(only=("a",))])
-def test_value_in_force_is_set_by_nobody_and_judged_by_no_limit(limit: Limit) -> None:
+def test_value_in_force_is_not_set_again_and_no_limit_judges_it(limit: Limit) -> None:
     desk = Desk(limited(tip_bias_voltage=limit))
     desk.later(experiment_s=1000.0)
     assert all(desk.measures("a", **A).ok for _ in range(5))
@@ -242,7 +242,7 @@ def test_return_of_what_another_has_lent_since_is_ignored() -> None:
     assert desk.loans == {BIAS: "b"}
 
 
-def test_base_is_that_of_before_the_first_loan() -> None:
+def test_base_is_the_value_before_the_first_loan() -> None:
     desk = Desk()
     desk.measures("a", **A)
     desk.measures("b", **B)
@@ -253,7 +253,7 @@ def test_base_is_that_of_before_the_first_loan() -> None:
 # --- others act ---
 
 
-def test_value_of_a_person_is_the_base_and_it_is_told() -> None:
+def test_value_of_a_person_is_the_base_and_logged() -> None:
     desk = Desk()
     desk.measures("a", **A)
     desk.panel[BIAS] = 0.7
@@ -375,7 +375,7 @@ def test_no_value_stays_for_hours_at_a_free_microscope() -> None:
     assert desk.panel[BIAS] == 0.1
 
 
-def test_end_waits_for_what_is_set_back() -> None:
+def test_end_waits_for_settings_on_their_way_back() -> None:
     desk = Desk()
     desk.measures("a", **A)
     assert not [one for one in desk.ask("a", ControlRequest.END_EXPERIMENT) if type(one).__name__ == "Kill"]
@@ -466,6 +466,12 @@ def test_way_goes_in_the_steps_that_limits_allow() -> None:
     assert [one[BIAS] for one in desk.measured] == [0.3, -0.1] * 2
     ways = [0.1, *(float(value) for _, value in desk.sets)]
     assert max(abs(b - a) for a, b in itertools.pairwise(ways)) <= 0.25 + 1e-9
+
+
+def test_value_beyond_its_range_is_refused_before_the_first_step_to_it() -> None:
+    desk = Desk(limited(tip_bias_voltage=Limit(high=3.0, step=0.25, unit="V")))
+    assert "above the highest allowed, 3 V" in desk.measures("a", tip_bias_voltage="4 V").reason
+    assert desk.sets == []
 
 
 def test_steps_at_a_controller_that_rounds_end_at_the_value() -> None:

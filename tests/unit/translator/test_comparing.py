@@ -51,7 +51,7 @@ def begin_values(bench: Any, scan: Any) -> list[tuple[str, str | None]]:
     return [(one.name, one.value) for one in found.begin_values]
 
 
-def test_values_in_force_are_those_that_a_controller_can_not_tell_apart(make_bench: Any) -> None:
+def test_values_that_a_controller_can_not_tell_apart_are_in_force(make_bench: Any) -> None:
     bench = make_bench({"parameters": {BIAS: {"resolution": "2 mV"}}})
     bench.microscope.values["Bias"] = 100.6
     known = (volts("0.1"), volts("0.2"), Parameter(BIAS, "101", "mV"))

@@ -3,7 +3,7 @@
 A LEND, the start of a measurement or treatment, and a RETURN take a turn of several steps:
 
 1. the values in force are read in one request, and compared with the book (`loans.LoanBook.compared`);
-2. what has to change is ordered once (`setting_order.widening_first`), and sent in the steps that limits allow, each
+2. the changes are ordered once (`setting_order.widening_first`), and sent in the steps that limits allow, each
    checked right before it is sent, as a request of a client would be;
 3. a change of bias, setpoint or gains with the tip at the sample settles;
 4. a LEND or RETURN is answered; a start goes on through the stages of `request_pipeline`.
@@ -246,6 +246,9 @@ def _decided(draft: StateDraft, job: ForwardedRequest, turn: Turn, lending: Lend
             why = f"the microscope has no parameter {one.name}"
             _refuse(draft, job, Response(int(ControlResponse.PARAM_NOT_SUPPORTED), b"", why, job.request.id))
             return None
+        if beyond := draft.limits.beyond_range(one) if one not in found.known else "":  # before the first step to it
+            _refuse(draft, job, Response(int(ControlResponse.PARAM_ERROR), b"", beyond, job.request.id))
+            return None
         key = key_of(one.name, kind)
         lender = job.client if _is_loan(draft, found, key) else ""
         if one not in found.known:
@@ -481,7 +484,7 @@ def _as_param(job: ForwardedRequest, parameter: Parameter) -> Request:
 
 
 def may_return(draft: StateDraft) -> bool:
-    """Return whether settings may be set back now, with nobody else at work."""
+    """Return whether settings may be set back now, with no other component at work."""
     control, tip = draft.control, draft.watchdog
     if control.mode is ControlMode.MANUAL or draft.barrier.until_s is not None or not draft.forwarder.up:
         return False
@@ -539,7 +542,7 @@ def due_s(state: SchedulerState | StateDraft) -> float | None:
 
 
 def publish_changes(draft: StateDraft) -> None:
-    """Publish what is lent if it has changed, and no more changes are on their way."""
+    """Publish the loans if they have changed, and no more changes are on their way."""
     turn, book = draft.pending.turn, draft.loans
     if book.loans is draft.before.loans.loans and book.shown is not None and turn is draft.before.pending.turn:
         return

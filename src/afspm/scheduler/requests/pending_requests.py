@@ -66,12 +66,12 @@ class WayStep:
 
 @dataclass(frozen=True)
 class Lending:
-    """The settings before a measurement: what was read, what is still to be sent, and the wait after it.
+    """The settings before a measurement: the values read, the values to be sent, and the wait after them.
 
     Attributes:
         compared: the translator's answers by name.
         now: the values in force by name.
-        way: what is still to be set, in order; None: the values in force are being read.
+        way: the values to be set, in order; None: the values in force are being read.
         kind: the present kind of curve; empty: the microscope shows none.
         kind_before: the kind to be set back at the end; empty: none.
         sent: the value on its way to the microscope.

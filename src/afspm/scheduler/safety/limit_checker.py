@@ -183,14 +183,20 @@ class LimitChecker:
         reported = self.state.last_seen.get(names.SPEC_KIND)
         return (reported and reported.value) or ""
 
-    def outside(self, changed: Parameter) -> str:
-        """Return why a value that a person has set lies outside its range or in a forbidden state; empty: neither."""
-        limit, value = self.limits.parameters.get(changed.name), self.number(changed)
+    def beyond_range(self, wanted: Parameter) -> str:
+        """Return why a value lies outside its range; empty: it does not."""
+        limit, value = self.limits.parameters.get(wanted.name), self.number(wanted)
         if limit is not None and value is not None:
             try:
-                self._check_range(changed.name, value, limit, _TOLD_REACH)
+                self._check_range(wanted.name, value, limit, _TOLD_REACH)
             except _Breach as breach:
                 return breach.reason
+        return ""
+
+    def outside(self, changed: Parameter) -> str:
+        """Return why a value that a person has set lies outside its range or in a forbidden state; empty: neither."""
+        if beyond := self.beyond_range(changed):
+            return beyond
         present = PresentState(
             {name: (value,) for name, value in {**self.state.last_seen, changed.name: changed}.items()}
         )

@@ -110,8 +110,10 @@ class Rescanner(Component):
             if kind == RescanKind.SEARCH:  # saved, so that it is also restored after a kill
                 self.memory.setdefault(_FRAME_BEFORE, [*region.center_m, *region.size_m, region.angle_rad, shape])
                 self.memory.save()
-            direction = names.UP if message.upwards else names.DOWN
-            with self.scope.settings({names.SCAN_DIRECTION: direction} if message.HasField("upwards") else {}):
+            settings = self.scope.settings_of()  # like is registered with like
+            if message.HasField("upwards"):
+                settings[names.SCAN_DIRECTION] = names.UP if message.upwards else names.DOWN
+            with self.scope.settings(settings):
                 for attempt in range(1 if kind == RescanKind.OPPOSITE else self.attempts):
                     self._drop_waiting(mappings)
                     if kind == RescanKind.SEARCH:
