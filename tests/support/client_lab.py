@@ -19,9 +19,7 @@ from afspm.client.component import Component
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
 from afspm.model import (
-    LEND_REQUEST,
     RELAY_REQUEST,
-    RETURN_REQUEST,
     ControlRequest,
     ControlResponse,
     ControlState,
@@ -38,9 +36,9 @@ from afspm.model import (
     ScanParameters,
     ScopeState,
     ScopeStatus,
-    Settings,
     Spectrum,
 )
+from afspm.model.requests import LEND_REQUEST, RETURN_REQUEST, Settings
 from afspm.model.state import FeedbackUnits
 from afspm.scheduler.control import arbitration as a
 from afspm.simulation.simulator import Simulator

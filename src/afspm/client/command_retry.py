@@ -14,9 +14,7 @@ from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.parameter_text import Value, value_in
 from afspm.model import (
-    LEND_REQUEST,
     RELAY_REQUEST,
-    RETURN_REQUEST,
     ControlRequest,
     ControlResponse,
     Parameter,
@@ -25,11 +23,11 @@ from afspm.model import (
     Response,
     ResponseDetail,
     ScopeState,
-    Settings,
     request_name,
 )
 from afspm.model.events import MeasurementSettings
 from afspm.model.microscope_status import feedback_of
+from afspm.model.requests import LEND_REQUEST, RETURN_REQUEST, Settings
 from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S
 from afspm.wire.messages import FEEDBACK, LENT_SETTINGS
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from afspm.basics.units import convert
 from afspm.components.tip_judge import TipJudge, Verdict
 from afspm.model import Scan
-from afspm.model.caption import picture_settings
 
 ENOUGH_SCANS = 3  # before a channel counts as missing; the channels of one scan come one by one
 
@@ -29,7 +28,7 @@ class HeightPair:
         """
         retrace = None if self.retrace is None else self.retrace.values * convert(1.0, self.retrace.unit, "m")
         trace = self.trace.values * convert(1.0, self.trace.unit, "m")
-        settings = picture_settings(self.trace.in_force)
+        settings = self.trace.picture_settings
         return judge.judge(trace, retrace, self.trace.region, settings=settings, learns=learns)
 
 

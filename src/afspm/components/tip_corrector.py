@@ -23,7 +23,6 @@ from afspm.components.tip_treatments import Treatment, TreatmentPlaces, treatmen
 from afspm.components.tip_verdict import read_verdict
 from afspm.components.tip_workshop import DONE_ACTION, TipWorkshop
 from afspm.model import HEIGHT, HEIGHT_RETRACE, ChannelName, Problem, Region, Scan, ScanSet, names
-from afspm.model.caption import picture_settings
 
 Frame = list[Any]
 """Region, pixels and settings in JSON's types: centre, size and angle; rows and columns; values to lend, by parameter.
@@ -363,7 +362,7 @@ class TipCorrector(Component):
     def _learn(self, scan: Scan, problems: tuple[int, ...]) -> None:
         if self.judge is None or problems:
             return
-        settings = picture_settings(scan.in_force)
+        settings = scan.picture_settings
         if self._experience is None and self.judge.knows(scan.region, scan.shape, settings):
             return
         pair = self.pairing.add(scan)

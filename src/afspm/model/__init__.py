@@ -61,27 +61,20 @@ if TYPE_CHECKING:
     from afspm.model.registration_outcome import RegistrationOutcome, registration_summary
     from afspm.model.requests import (
         CLOCK_REQUEST,
-        COMPARE_REQUEST,
         GRANT_REQUEST,
         HAS_ENDED,
         LEASE_AT_ONCE_S,
         LEASE_REQUEST,
-        LEND_REQUEST,
         RELAY_REQUEST,
         RESTART_REQUEST,
-        RETURN_REQUEST,
         WAIT_FOR_CONTROL,
         ControlRequest,
         ControlResponse,
-        LoanInForce,
-        LoansInForce,
         Parameter,
         Request,
         RescanKind,
         Response,
         ResponseDetail,
-        Setting,
-        Settings,
         request_name,
     )
     from afspm.model.scan import Scan, ScanLines, ScanParameters, ScanSet
@@ -100,20 +93,17 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CLOCK_REQUEST",
-    "COMPARE_REQUEST",
     "GRANT_REQUEST",
     "HAS_ENDED",
     "HEIGHT",
     "HEIGHT_RETRACE",
     "LEASE_AT_ONCE_S",
     "LEASE_REQUEST",
-    "LEND_REQUEST",
     "LONGEST_NOTE",
     "PERSON",
     "RELAY_REQUEST",
     "RESTART_REQUEST",
     "RETRACE",
-    "RETURN_REQUEST",
     "STOPPED_BY_AGENT",
     "TOPOGRAPHY",
     "WAIT_FOR_CONTROL",
@@ -139,8 +129,6 @@ __all__ = [
     "InstrumentReadings",
     "JournalEntries",
     "JournalEntry",
-    "LoanInForce",
-    "LoansInForce",
     "LogLine",
     "LoggedPacket",
     "MeasurementConditions",
@@ -175,8 +163,6 @@ __all__ = [
     "ScanSet",
     "ScopeState",
     "ScopeStatus",
-    "Setting",
-    "Settings",
     "Spectrum",
     "TipStatus",
     "both_ways",
@@ -207,10 +193,9 @@ if not TYPE_CHECKING:
             "afspm.model.problems": "STOPPED_BY_AGENT Problem ProblemNames",
             "afspm.model.registration_outcome": "RegistrationOutcome registration_summary",
             "afspm.model.requests": (
-                "CLOCK_REQUEST COMPARE_REQUEST GRANT_REQUEST HAS_ENDED LEASE_AT_ONCE_S LEASE_REQUEST "
-                "LEND_REQUEST RELAY_REQUEST RESTART_REQUEST RETURN_REQUEST WAIT_FOR_CONTROL ControlRequest "
-                "ControlResponse LoanInForce LoansInForce Parameter Request RescanKind Response ResponseDetail "
-                "Setting Settings request_name"
+                "CLOCK_REQUEST GRANT_REQUEST HAS_ENDED LEASE_AT_ONCE_S LEASE_REQUEST RELAY_REQUEST "
+                "RESTART_REQUEST WAIT_FOR_CONTROL ControlRequest ControlResponse Parameter Request RescanKind "
+                "Response ResponseDetail request_name"
             ),
             "afspm.model.scan": "Scan ScanLines ScanParameters ScanSet",
             "afspm.model.scan_history": "ScanHistory",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 from afspm.basics import NoSuchItem, imports_of_extra, utc_time
 from afspm.basics.entry_points import DISPLAYS, required
 from afspm.basics.errors import InvalidValue
-from afspm.model.caption import SettingInForce, caption
+from afspm.model.caption import SettingInForce, caption, picture_settings
 from afspm.model.geometry import XY, Region, RegionChange
 
 if TYPE_CHECKING:
@@ -154,6 +154,11 @@ class Scan:
     def caption(self) -> str:
         """Return the settings that were in force, "V = 100 mV, I = 20 pA, 5 nm/s"; empty if none is known."""
         return caption(self.in_force)
+
+    @property
+    def picture_settings(self) -> dict[str, float]:
+        """The settings on which a picture of one place depends: bias, setpoint, speed, and gains of the run."""
+        return picture_settings(self.in_force)
 
     def is_of(self, channel: str) -> bool:
         """Return whether a channel, given by its name or role, is this one."""

@@ -25,8 +25,6 @@ from afspm.model import (
     InstrumentReadings,
     JournalEntries,
     JournalEntry,
-    LoanInForce,
-    LoansInForce,
     LogLine,
     MeasurementConditions,
     Note,
@@ -53,6 +51,7 @@ from afspm.model.events import PERSON, LogLines
 from afspm.model.grants import with_proposal
 from afspm.model.parameter_names import START_SCAN
 from afspm.model.problems import CONDITIONS
+from afspm.model.requests import LoanInForce, LoansInForce
 from afspm.night.expected_end import Plans, expected_end_ns
 from afspm.night.measurement_history import (
     SOON_NS,

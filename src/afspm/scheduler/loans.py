@@ -25,8 +25,11 @@ from dataclasses import dataclass, field
 
 from afspm.basics.frozen import replace, without
 from afspm.basics.units import convert
-from afspm.model import LoanInForce, LoansInForce, Parameter, Setting, names
-from afspm.model.requests import amount_text
+from afspm.model import (
+    Parameter,
+    names,
+)
+from afspm.model.requests import LoanInForce, LoansInForce, Setting, amount_text
 
 SETTLES = frozenset(
     (names.TIP_BIAS_VOLTAGE, names.SAMPLE_BIAS, names.ZCTRL_SETPOINT, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN)

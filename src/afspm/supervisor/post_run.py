@@ -23,8 +23,8 @@ from afspm.basics.progress_line import ProgressLine
 from afspm.components import notifications
 from afspm.components.notifications import END, GIVEN_UP, NotDelivered, Notification, Targets, Way
 from afspm.experiment import Role, implied_parts
-from afspm.model import LoansInForce
 from afspm.model.events import LOGGED_AS
+from afspm.model.requests import LoansInForce
 from afspm.night.run import open_run
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.run_json import STATE_DIR

@@ -15,7 +15,6 @@ from afspm.basics import units
 from afspm.basics.errors import AfspmError, ConfigError, InvalidValue, Refused
 from afspm.basics.plain_data import PlainMapping
 from afspm.model import (
-    COMPARE_REQUEST,
     ControlRequest,
     ControlResponse,
     Parameter,
@@ -23,12 +22,11 @@ from afspm.model import (
     Response,
     ResponseDetail,
     ScopeState,
-    Setting,
-    Settings,
     names,
     request_name,
 )
 from afspm.model.microscope_status import STARTS
+from afspm.model.requests import COMPARE_REQUEST, Setting, Settings
 from afspm.translator.claims import Claims
 from afspm.translator.driver_base import LOST, Action, DriverBase
 from afspm.translator.hurry import unhurried

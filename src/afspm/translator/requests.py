@@ -12,7 +12,6 @@ from functools import partial
 from afspm import wire
 from afspm.basics.errors import WireError
 from afspm.model import (
-    COMPARE_REQUEST,
     ControlRequest,
     ControlResponse,
     Parameter,
@@ -25,6 +24,7 @@ from afspm.model import (
 from afspm.model.fencing import Epoch, SchedulerFence
 from afspm.model.idempotency_cache import TOO_OLD, Floors
 from afspm.model.microscope_status import STARTS, feedback_of
+from afspm.model.requests import COMPARE_REQUEST
 from afspm.model.sessions import number_of, run_of
 from afspm.translator.commands import ASIDE, CommandOutcome, Commands
 from afspm.translator.connection import Connection

@@ -13,13 +13,10 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from afspm.basics.errors import AfspmError, InvalidValue, WireError
 from afspm.model import (
     CLOCK_REQUEST,
-    COMPARE_REQUEST,
     GRANT_REQUEST,
     LEASE_REQUEST,
-    LEND_REQUEST,
     RELAY_REQUEST,
     RESTART_REQUEST,
-    RETURN_REQUEST,
     ControlRequest,
     ControlResponse,
     Packet,
@@ -29,7 +26,7 @@ from afspm.model import (
     ResponseDetail,
     request_name,
 )
-from afspm.model.requests import LONGEST_LEASE_S
+from afspm.model.requests import COMPARE_REQUEST, LEND_REQUEST, LONGEST_LEASE_S, RETURN_REQUEST
 from afspm.wire import unit_conversion
 from afspm.wire.codec import encode
 from afspm.wire.generated import control_pb2, scan_pb2, spectroscopy_pb2

@@ -19,6 +19,7 @@ from afspm.basics.errors import InvalidValue
 from afspm.model.events import LogLines, MeasurementSettings
 from afspm.model.instruments import InstrumentOrders
 from afspm.model.panel import ChangedValue
+from afspm.model.requests import LoanInForce, LoansInForce, Setting, Settings
 from afspm.model.state import FeedbackUnits
 from afspm.model.variables import VariableRoles
 from afspm.wire.generated import (
@@ -277,7 +278,7 @@ RELAYED = MessageMapping(
 )
 INSTRUMENT_ORDERS = MessageMapping(InstrumentOrders, journal_pb2.Orders, "token", orders=_each("instrument", _ORDER))
 _SETTING = MessageMapping(
-    model.Setting,
+    Setting,
     loans_pb2.LentSetting,
     parameter=FieldMapping("parameter", PARAMETER.to_wire, PARAMETER.from_wire),
     known=_each("known", PARAMETER),
@@ -285,13 +286,13 @@ _SETTING = MessageMapping(
     is_lent="lent",
 )
 SETTINGS = MessageMapping(
-    model.Settings,
+    Settings,
     loans_pb2.LentSettings,
     settings=_each("settings", _SETTING),
     settle_s=FieldMapping("settle", from_wire=_wait),
 )
 _LOAN = MessageMapping(
-    model.LoanInForce,
+    LoanInForce,
     loans_pb2.Loan,
     value=FieldMapping("value", PARAMETER.to_wire, PARAMETER.from_wire),
     base=FieldMapping("base", PARAMETER.to_wire, PARAMETER.from_wire),
@@ -413,7 +414,7 @@ MAPPINGS: tuple[MessageMapping[Any], ...] = (
     _NOTE,
     _SWEPT,
     SETTINGS,
-    MessageMapping(model.LoansInForce, loans_pb2.Loans, loans=_each("loans", _LOAN)),
+    MessageMapping(LoansInForce, loans_pb2.Loans, loans=_each("loans", _LOAN)),
     MessageMapping(
         model.InstrumentReadings,
         instruments_pb2.InstrumentReadings,

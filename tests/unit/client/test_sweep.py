@@ -14,8 +14,6 @@ from afspm import wire
 from afspm.basics.errors import InvalidValue, Refused
 from afspm.client.scope import Scope
 from afspm.model import (
-    LEND_REQUEST,
-    RETURN_REQUEST,
     ControlRequest,
     ControlResponse,
     MeasurementConditions,
@@ -26,12 +24,12 @@ from afspm.model import (
     Response,
     ResponseDetail,
     ScopeState,
-    Settings,
     Spectrum,
     TipStatus,
     names,
 )
 from afspm.model.events import MeasurementSettings
+from afspm.model.requests import LEND_REQUEST, RETURN_REQUEST, Settings
 from afspm.model.sweep_plan import SweptValues
 from afspm.scheduler.control.arbitration import ArbitrationEvent
 

@@ -15,8 +15,6 @@ from afspm.basics.errors import MeasurementFailed, Refused
 from afspm.basics.exit_codes import ExitCode
 from afspm.components.feedback_tuner import FeedbackTuner
 from afspm.model import (
-    LEND_REQUEST,
-    RETURN_REQUEST,
     ControlRequest,
     ControlResponse,
     Feedback,
@@ -29,6 +27,7 @@ from afspm.model import (
     ScopeState,
     names,
 )
+from afspm.model.requests import LEND_REQUEST, RETURN_REQUEST
 
 SETPOINT = 0.5
 BEFORE = 1.0

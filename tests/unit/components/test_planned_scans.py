@@ -18,9 +18,7 @@ from afspm.components.planned_scans import ScanList, ScanSeries
 from afspm.components.spectroscopy_grid import SpectroscopyGrid
 from afspm.components.tip_verdict import BAD, GOOD, MESSAGE, LineVerdict, line_verdict_message, verdict_message
 from afspm.model import (
-    LEND_REQUEST,
     RELAY_REQUEST,
-    RETURN_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
@@ -34,6 +32,7 @@ from afspm.model import (
     Scan,
     ScanParameters,
 )
+from afspm.model.requests import LEND_REQUEST, RETURN_REQUEST
 
 
 def series(scans: int = 3, *, keep_control: bool = False, end_when_done: bool = True, **planned: Any) -> ScanSeries:

@@ -15,7 +15,12 @@ from tests.unit.components.survey_lab import PARTICLES, ParticleLab
 from afspm.basics.errors import ConfigError
 from afspm.basics.exit_codes import ExitCode
 from afspm.components.survey import Survey
-from afspm.model import LEND_REQUEST, ControlRequest, Problem, Scan
+from afspm.model import (
+    ControlRequest,
+    Problem,
+    Scan,
+)
+from afspm.model.requests import LEND_REQUEST
 
 pytest.importorskip("skimage")
 CURVES: Any = {"top": 0.0, "beside": 200e-9, "left": (-100e-9, 0.0)}

@@ -11,9 +11,6 @@ from tests.unit.scheduler.logic_lab import Lab, as_saved, replies
 
 from afspm.basics.units import convert
 from afspm.model import (
-    COMPARE_REQUEST,
-    LEND_REQUEST,
-    RETURN_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
@@ -22,11 +19,10 @@ from afspm.model import (
     Response,
     ResponseDetail,
     ScopeState,
-    Setting,
-    Settings,
     names,
 )
 from afspm.model.parameter_names import BASE_PARAMETERS, OF_CURVES
+from afspm.model.requests import COMPARE_REQUEST, LEND_REQUEST, RETURN_REQUEST, Setting, Settings
 from afspm.scheduler.control.arbitration import RoleTable, Rules
 from afspm.scheduler.events import Log, SaveState, Tick, TranslatorDown
 from afspm.scheduler.safety.limits import ExperimentLimits, Limit

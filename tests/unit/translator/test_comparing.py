@@ -8,7 +8,6 @@ import pytest
 
 from afspm import wire
 from afspm.model import (
-    COMPARE_REQUEST,
     ControlRequest,
     ControlResponse,
     MeasurementConditions,
@@ -16,10 +15,9 @@ from afspm.model import (
     Response,
     ResponseDetail,
     ScopeState,
-    Setting,
-    Settings,
     names,
 )
+from afspm.model.requests import COMPARE_REQUEST, Setting, Settings
 
 OK = ControlResponse.SUCCESS
 ACTION, PARAM = ControlRequest.ACTION, ControlRequest.PARAM

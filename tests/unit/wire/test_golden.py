@@ -12,7 +12,7 @@ import pytest
 from google.protobuf import json_format
 
 from afspm import model, wire
-from afspm.model import ControlRequest, ControlResponse
+from afspm.model import ControlRequest, ControlResponse, requests
 from afspm.wire.messages import MessageKind, declared, message_type
 
 GOLDEN = json.loads((Path(__file__).parents[3] / "proto" / "golden.json").read_text(encoding="utf-8"))
@@ -58,7 +58,7 @@ def test_every_declared_message_has_reference_bytes() -> None:
 
 
 def test_every_own_request_has_reference_bytes() -> None:
-    numbers = {value for name, value in vars(model).items() if name.endswith("_REQUEST")}
+    numbers = {value for name, value in vars(requests).items() if name.endswith("_REQUEST")}
     assert {entry["request"] for entry in GOLDEN["our_requests"]} == numbers
 
 
@@ -146,7 +146,7 @@ def test_requests_that_version_1_does_not_know(entry: Any) -> None:
     assert (request.kind, request.id) == (entry["request"], "exp/1/7")
     if isinstance(request.subject, model.RelayedMessage):
         assert [request.subject.message, bytes(request.subject.payload).hex()] == entry["object"]
-    elif isinstance(request.subject, model.Grant | model.Settings):
+    elif isinstance(request.subject, model.Grant | requests.Settings):
         name, payload = wire.encode(request.subject)
         assert [name, payload.hex()] == entry["object"]
     else:

@@ -25,7 +25,6 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
-from afspm.model.caption import picture_settings
 from afspm.plugins.line_watch.line_judge import (
     Alarm,
     AlarmLevel,
@@ -436,7 +435,7 @@ class LineWatch(Component):
         return f"{self._condition} {carried}".strip()
 
     def _kind(self, scan: Scan) -> Kind:
-        if not (carried := _carried_text(picture_settings(scan.in_force)) or self._carried):
+        if not (carried := _carried_text(scan.picture_settings) or self._carried):
             carried = self._carried = self._bias_and_speed()  # of a scan before this process was started
         return Kind.of(scan.region, scan.shape, self._condition_of(carried))
 

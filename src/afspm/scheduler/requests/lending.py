@@ -18,9 +18,6 @@ from collections.abc import Mapping
 
 from afspm.basics.frozen import replace
 from afspm.model import (
-    COMPARE_REQUEST,
-    LEND_REQUEST,
-    RETURN_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
@@ -28,13 +25,11 @@ from afspm.model import (
     Problem,
     Request,
     Response,
-    Setting,
-    Settings,
     names,
 )
 from afspm.model.microscope_status import STOPS
 from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES
-from afspm.model.requests import amount_text
+from afspm.model.requests import COMPARE_REQUEST, LEND_REQUEST, RETURN_REQUEST, Setting, Settings, amount_text
 from afspm.model.setting_order import widening_first
 from afspm.scheduler.loans import SETTLES, LoanBook, equal, key_of, kind_of, may_be_lent
 from afspm.scheduler.publishing.event_log import SCHEDULER

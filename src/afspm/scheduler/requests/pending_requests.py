@@ -6,8 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from afspm.basics.frozen import replace
-from afspm.model import Parameter, Response, ScopeState, ScopeStatus, Setting
+from afspm.model import (
+    Parameter,
+    Response,
+    ScopeState,
+    ScopeStatus,
+)
 from afspm.model.microscope_status import MicroscopeStatus
+from afspm.model.requests import Setting
 from afspm.scheduler.events import RequestIn
 from afspm.scheduler.requests.forwarder import ForwardedRequest
 

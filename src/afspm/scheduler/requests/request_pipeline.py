@@ -28,13 +28,11 @@ from afspm.basics.errors import InvalidValue
 from afspm.basics.frozen import replace
 from afspm.model import (
     CLOCK_REQUEST,
-    COMPARE_REQUEST,
     GRANT_REQUEST,
     HAS_ENDED,
     LEASE_REQUEST,
     RELAY_REQUEST,
     RESTART_REQUEST,
-    RETURN_REQUEST,
     ControlMode,
     ControlRequest,
     ControlResponse,
@@ -43,13 +41,12 @@ from afspm.model import (
     Request,
     Response,
     ResponseDetail,
-    Settings,
     component_of,
     names,
 )
 from afspm.model.idempotency_cache import TOO_OLD, RequestStatus
 from afspm.model.microscope_status import feedback_of
-from afspm.model.requests import OTHER_RUN_RESPONSE
+from afspm.model.requests import COMPARE_REQUEST, OTHER_RUN_RESPONSE, RETURN_REQUEST, Settings
 from afspm.model.sessions import Hearing, run_of
 from afspm.scheduler.control import control_change
 from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlChange, ControlInput, Rules, reason, row_for

@@ -22,9 +22,7 @@ from afspm.basics.frozen import replace
 from afspm.model import (
     CLOCK_REQUEST,
     LEASE_REQUEST,
-    LEND_REQUEST,
     RELAY_REQUEST,
-    RETURN_REQUEST,
     Approval,
     Approvals,
     ControlRequest,
@@ -46,6 +44,7 @@ from afspm.model.geometry import XY
 from afspm.model.microscope_status import STARTS
 from afspm.model.parameter_names import BASE_PARAMETERS, OF_CURVES
 from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES
+from afspm.model.requests import LEND_REQUEST, RETURN_REQUEST
 from afspm.model.snapshot import to_plain
 from afspm.scheduler.control.arbitration import ArbitrationState, Rules
 from afspm.scheduler.safety.limit_checker import LimitChecker, is_get
