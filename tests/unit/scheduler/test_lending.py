@@ -643,6 +643,19 @@ def test_parameter_that_may_not_be_lent_stays_as_it_is_set() -> None:
     assert desk.loans == {}
 
 
+def test_journal_names_the_settings_in_words() -> None:
+    desk = Desk()
+    desk.measures("a", **A, scan_speed="2 um/s")
+    desk.gives_back("a", BIAS)
+    desk.gives_back("a")
+    what = [one.what for one in desk.entries() if one.request in (LEND_REQUEST, RETURN_REQUEST)]
+    assert what == [
+        "settings of a measurement: tip-bias-voltage = 500 mV, scan-speed = 2 µm/s",
+        "sets back tip-bias-voltage",
+        "sets back all that it has lent",
+    ]
+
+
 def test_place_is_no_setting_of_a_measurement() -> None:
     desk = Desk()
     desk.take_control("a")

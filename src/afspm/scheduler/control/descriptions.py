@@ -37,6 +37,7 @@ from afspm.model import (
     request_name,
 )
 from afspm.model.panel import ChangedValue
+from afspm.model.requests import LEND_REQUEST, RETURN_REQUEST, Settings
 from afspm.model.scan import ShapeChange
 from afspm.scheduler.control.arbitration import (
     ArbitrationEvent,
@@ -166,6 +167,17 @@ def _parameter(subject: object, problems: ProblemNames) -> str:
     return f"{subject.name} = {_value(subject.value, subject.unit or '')}"
 
 
+def _settings(subject: object, problems: ProblemNames) -> str:
+    given = subject.parameters if isinstance(subject, Settings) else ()
+    texts = (one.name if one.value is None else f"{one.name} = {_value(one.value, one.unit or '')}" for one in given)
+    return f"settings of a measurement: {', '.join(texts) or 'none'}"
+
+
+def _returned(subject: object, problems: ProblemNames) -> str:
+    given = subject.parameters if isinstance(subject, Settings) else ()
+    return f"sets back {', '.join(one.name for one in given) or 'all that it has lent'}"
+
+
 def _value(text: str, unit: str) -> str:
     # a prefix is chosen where the unit is SI; any other unit stays as it was sent
     try:
@@ -244,4 +256,6 @@ _WORDS: dict[int, Callable[[Any, ProblemNames], str]] = {
     GRANT_REQUEST: lambda subject, problems: _grant(subject),
     LEASE_REQUEST: lambda subject, problems: f"keeps control for {subject:g} s",
     RESTART_REQUEST: lambda subject, problems: f"restart {subject}",
+    LEND_REQUEST: _settings,
+    RETURN_REQUEST: _returned,
 }
