@@ -13,6 +13,7 @@ from afspm import wire
 from afspm.basics import FileError, NeverLate, PlainList, WireError
 from afspm.client.port_log import LifeFacts
 from afspm.model import CLOCK_REQUEST, LEASE_REQUEST, RELAY_REQUEST, ControlRequest, ControlResponse, Packet, Response
+from afspm.model.requests import RETURN_REQUEST
 from afspm.storage.line_log import read_lines
 from afspm.transport import ParentGone
 from afspm.transport.port import (
@@ -34,6 +35,7 @@ _SIGNALS = {one.__name__: one for one in (Killed, ParentGone, ControlConnected, 
 _ANSWERABLE = {
     ControlRequest.REQUEST_CTRL, ControlRequest.RELEASE_CTRL, ControlRequest.ADD_EXP_PRBLM,
     ControlRequest.RMV_EXP_PRBLM, ControlRequest.ACTION_SUPPORT, CLOCK_REQUEST, RELAY_REQUEST, LEASE_REQUEST,
+    RETURN_REQUEST,
 }  # fmt: skip
 _DONE = "answered"
 _MOST_POLLS = 100_000  # without any progress
@@ -385,7 +387,7 @@ class ReplayPort:
         if request.kind == ControlRequest.PARAM and request.subject.value is None:
             return self._answers.last_value(request.subject.name, request_id)
         if request.kind not in _ANSWERABLE:
-            self.unanswered = self.outputs[-1].text
+            self.unanswered = self.unanswered or self.outputs[-1].text
             raise LifeOver
         return Response(int(ControlResponse.SUCCESS), b"", "", request_id)
 
