@@ -48,10 +48,6 @@ MUTANTS: Final[Mapping[str, tuple[Any, str, Any]]] = {
         "sending",
         lambda book, key, now, value, lender, kind: book._with(key, Loan(now, value, lender or "x", kind)),
     ),
-    "gives nothing back": (lending, "may_return", lambda draft: False),
-    "gives back in MANUAL": (lending, "may_return", lambda draft: draft.microscope.is_free and draft.forwarder.up),
-    "decides nothing": (LoanBook, "decided", lambda book, parameters, kind: book),
-    "forgets what was stated": (lending, "has_forgotten", lambda draft, job: False),
     "answers before all is set": (lending, "_in_order", lambda draft, found, way: tuple(way[:1])),
 }
 """Parts of the book of loans that are left out, each of which a night must see."""
