@@ -25,12 +25,14 @@ from afspm.model import (
     Problem,
     Request,
     Response,
+    ResponseDetail,
     names,
 )
 from afspm.model.microscope_status import STOPS
 from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES
 from afspm.model.requests import COMPARE_REQUEST, LEND_REQUEST, RETURN_REQUEST, Setting, Settings, amount_text
 from afspm.model.setting_order import widening_first
+from afspm.scheduler.events import RequestIn
 from afspm.scheduler.loans import SETTLES, LoanBook, equal, key_of, kind_of, may_be_lent
 from afspm.scheduler.publishing.event_log import SCHEDULER
 from afspm.scheduler.publishing.own_packets import publish
@@ -39,7 +41,7 @@ from afspm.scheduler.requests.forwarder import CompareForTurn, ForwardedRequest,
 from afspm.scheduler.requests.pending_requests import Lending, Turn, WayStep
 from afspm.scheduler.safety import present_state
 from afspm.scheduler.state import SchedulerState, StateDraft
-from afspm.wire.messages import LOANS
+from afspm.wire.messages import LENT_SETTINGS, LOANS
 
 MEASURES = frozenset((names.START_SCAN, names.START_SPEC, names.HOLD_Z, *names.TREATMENTS, *names.APPROACHES))
 """The actions that take place with what was stated for them, and with the base of all else."""
@@ -60,6 +62,35 @@ def takes_turn(draft: StateDraft, job: ForwardedRequest) -> bool:
         return False
     kinds = {loan.kind for loan in draft.loans.loans.values()}
     return any(draft.loans.due(str(request.subject), kind) for kind in kinds)
+
+
+def take_return(draft: StateDraft, event: RequestIn) -> bool:
+    """Process a RETURN; return whether it is queued, and answered once all is set back."""
+    draft.loans = draft.loans.returned_by(event.name, [one.name for one in event.request.subject.parameters])
+    if is_to_return(draft.loans) and may_return(draft):
+        return True
+    answers.answer(draft, event, ControlResponse.SUCCESS)
+    return False
+
+
+def before_returns(draft: StateDraft) -> list[ForwardedRequest]:
+    """Return the waiting requests without those to set back, which give way to commands after their first step."""
+    others, turn = [job for job in draft.forwarder.queue if job.request.kind != RETURN_REQUEST], draft.pending.turn
+    if turn is not None and turn.lending is not None and turn.lending.has_set and any(job.command for job in others):
+        of_turn = draft.forwarder.waiting(turn.number)
+        if of_turn is not None and of_turn.request.kind == RETURN_REQUEST:
+            draft.pending = replace(draft.pending, turn=None)
+    return others
+
+
+def refuses_forgotten(draft: StateDraft, job: ForwardedRequest) -> bool:
+    """Refuse a start, once, whose client may have stated something that is not known any more."""
+    if not has_forgotten(draft, job):
+        return False
+    why = "what was stated for this measurement is not known any more: state it again"
+    refusal = Response(int(ControlResponse.NOT_FREE), b"", why, job.request.id, ResponseDetail.STATE_AGAIN)
+    _answer_unsent(draft, job, refusal)
+    return True
 
 
 def has_forgotten(draft: StateDraft, job: ForwardedRequest) -> bool:
@@ -171,18 +202,30 @@ def _to_compare(draft: StateDraft, job: ForwardedRequest) -> dict[str, Setting]:
     return found
 
 
-def take_compared(draft: StateDraft, turn: Turn, found: Settings) -> None:
+def take_compared(draft: StateDraft, number: int, response: Response) -> None:
     """Store the translator's answer about the values in force."""
-    assert turn.lending is not None
-    compared = {one.parameter.name: one for one in found.settings}
-    turn = replace(turn.lacks(COMPARED), lending=replace(turn.lending, compared=compared))
-    for name, one in compared.items():
-        turn = replace(turn, values={**turn.values, name: one.parameter})
-    draft.pending = replace(draft.pending, turn=turn)
+    turn, job = draft.pending.turn, draft.forwarder.waiting(number)
+    if turn is None or job is None or turn.number != number or turn.lending is None:
+        return
+    found = draft.env.codec.decode_packet(LENT_SETTINGS.name, response.payload) if response.ok else None
+    if isinstance(found, Settings):
+        compared = {one.parameter.name: one for one in found.settings}
+        values = {**turn.values, **{name: one.parameter for name, one in compared.items()}}
+        turn = replace(turn.lacks(COMPARED), values=values, lending=replace(turn.lending, compared=compared))
+        draft.pending = replace(draft.pending, turn=turn)
+    elif response.code == ControlResponse.CMD_NOT_SUPPORTED:  # a translator of another make: the values are read
+        draft.loans = replace(draft.loans, is_compared=False)
+        draft.pending = replace(draft.pending, turn=Turn(number))
+    elif response.code == ControlResponse.NO_RESPONSE:
+        why = f"not sent: the read before it failed ({response.reason})"
+        _answer_unsent(draft, job, replace(response, reason=why))
+    else:
+        _answer_unsent(draft, job, response)
 
 
-def take_set(draft: StateDraft, purpose: SetForTurn, answered: Parameter | None, response: Response) -> None:
+def take_set(draft: StateDraft, purpose: SetForTurn, response: Response) -> None:
     """Store the answer to a step on the way of a loan, also if its request does not wait any more."""
+    answered = draft.env.codec.decode_parameter(response.payload) if response.payload else None
     if response.ok:
         in_force = answered if answered is not None and answered.value is not None else None
         if in_force is not None:

@@ -74,13 +74,11 @@ from afspm.scheduler.safety.forbidden_states import STARTED
 from afspm.scheduler.safety.limit_checker import is_get
 from afspm.scheduler.safety.movers import MoverState
 from afspm.scheduler.state import StateDraft
-from afspm.wire.messages import LENT_SETTINGS
 
 _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
 _ANOTHER_RUN = "this is the scheduler of another run: two experiments have the same address"
 _TWO_OF_A_NAME = "another component is connected as {name}; each needs a name of its own"
-_LACKING = (ControlResponse.PARAM_NOT_SUPPORTED, ControlResponse.CMD_NOT_SUPPORTED)
-"""The answers of a translator without this parameter, or without parameters."""
+_LACKING = (ControlResponse.PARAM_NOT_SUPPORTED, ControlResponse.CMD_NOT_SUPPORTED)  # this parameter, or all
 _CONTROL_EVENTS = {
     int(ControlRequest.REQUEST_CTRL): ArbitrationEvent.REQUEST_CONTROL,
     int(ControlRequest.RELEASE_CTRL): ArbitrationEvent.RELEASE_CONTROL,
@@ -229,7 +227,7 @@ def authorise(draft: StateDraft, event: RequestIn) -> bool:
     elif kind == GRANT_REQUEST:
         approvals.decide(draft, event)
     elif kind == RETURN_REQUEST:
-        return _take_return(draft, event)
+        return lending.take_return(draft, event)
     elif kind <= 0 or kind == COMPARE_REQUEST:
         why = f"there is no request with the number {kind}"
         answers.answer(draft, event, ControlResponse.CMD_NOT_SUPPORTED, why)
@@ -280,14 +278,6 @@ def _renew_lease(draft: StateDraft, event: RequestIn) -> None:
     draft.lease = draft.lease.asked(event.request.subject, draft.now_s)
     response = Response(int(ControlResponse.SUCCESS), b"", "", event.request.id)
     draft.effects.append(Reply(event.connection, name, response, LEASE_REQUEST))
-
-
-def _take_return(draft: StateDraft, event: RequestIn) -> bool:
-    draft.loans = draft.loans.returned_by(event.name, [one.name for one in event.request.subject.parameters])
-    if lending.is_to_return(draft.loans) and lending.may_return(draft):
-        return True  # answered once they are set back
-    answers.answer(draft, event, ControlResponse.SUCCESS)
-    return False
 
 
 def _answer_clock_request(draft: StateDraft, event: RequestIn) -> None:
@@ -366,13 +356,7 @@ def send_own(draft: StateDraft) -> None:
 
 
 def _next_job(draft: StateDraft) -> ForwardedRequest | None:
-    queue, turn = draft.forwarder.queue, draft.pending.turn
-    # no command waits for settings to be set back, unless it measures with them: that is its own turn
-    others = [job for job in queue if job.request.kind != RETURN_REQUEST]
-    if turn is not None and any(job.command for job in others):
-        of_turn, has_set = draft.forwarder.waiting(turn.number), turn.lending is not None and turn.lending.has_set
-        if of_turn is not None and of_turn.request.kind == RETURN_REQUEST and has_set:
-            draft.pending, turn = replace(draft.pending, turn=None), None
+    others, queue, turn = lending.before_returns(draft), draft.forwarder.queue, draft.pending.turn
     if turn is None:
         return next(iter([*others, *queue]), None)
     if turn.is_ready(draft.microscope, draft.now_s, draft.now_ns):
@@ -395,10 +379,7 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
         # the death of its earlier life is decided now: the tip is retracted, and this command is called back
         control_change.decide(draft, ControlInput(ArbitrationEvent.DEAD, job.client))
         return
-    if lending.has_forgotten(draft, job):
-        why = "what was stated for this measurement is not known any more: state it again"
-        refusal = Response(int(ControlResponse.NOT_FREE), b"", why, job.request.id, ResponseDetail.STATE_AGAIN)
-        _answer_unsent(draft, job, refusal)
+    if lending.refuses_forgotten(draft, job):
         return
     turn = draft.pending.turn or Turn(job.number)
     if lending.takes_turn(draft, job) if turn.lending is None else not turn.lending.is_done:
@@ -575,22 +556,6 @@ def _refusal_for_second_electrode(job: ForwardedRequest, turn: Turn) -> Response
     return Response(int(ControlResponse.PARAM_ERROR), b"", why, job.request.id)
 
 
-def _take_compared(draft: StateDraft, number: int, response: Response) -> None:
-    turn, job = draft.pending.turn, draft.forwarder.waiting(number)
-    if turn is None or job is None or turn.number != number or turn.lending is None:
-        return
-    found = draft.env.codec.decode_packet(LENT_SETTINGS.name, response.payload) if response.ok else None
-    if isinstance(found, Settings):
-        lending.take_compared(draft, turn, found)
-    elif response.code == ControlResponse.NO_RESPONSE:
-        _answer_unsent(draft, job, _failed_before(response))
-    elif response.code == ControlResponse.CMD_NOT_SUPPORTED:  # a translator of another make: the values are read
-        draft.loans = replace(draft.loans, is_compared=False)
-        draft.pending = replace(draft.pending, turn=Turn(number))
-    else:
-        _answer_unsent(draft, job, response)
-
-
 def _take_read_value(draft: StateDraft, number: int, name: str, response: Response) -> None:
     turn, job = draft.pending.turn, draft.forwarder.waiting(number)
     if turn is None or job is None or turn.number != number:
@@ -631,8 +596,7 @@ def read_ahead(draft: StateDraft) -> None:
 
 
 def _read(draft: StateDraft, name: str, purpose: OwnPurpose) -> None:
-    parameter = Parameter(name)
-    request = Request(_PARAM, parameter)
+    request = Request(_PARAM, Parameter(name))
     draft.forwarder, _ = draft.forwarder.ask_own(request, draft.now_s, purpose)
 
 
@@ -735,10 +699,9 @@ def _serve_purpose(draft: StateDraft, purpose: OwnPurpose, response: Response) -
         case ReadForOrder():
             instrument_requests.take_read_value(draft, purpose, response, _not_allowed_now)
         case CompareForTurn():
-            _take_compared(draft, purpose.number, response)
+            lending.take_compared(draft, purpose.number, response)
         case SetForTurn():
-            answered = draft.env.codec.decode_parameter(response.payload) if response.payload else None
-            lending.take_set(draft, purpose, answered, response)
+            lending.take_set(draft, purpose, response)
         case MoveForTurn():
             _take_move_result(draft, purpose.number, response)
         case AskForFrame():
