@@ -11,8 +11,8 @@ from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.instrument_targets import InstrumentTargets
 from afspm.client.keyed_results import KeyedResults
-from afspm.client.measurement_setup import PLACES
 from afspm.model import ControlRequest, Parameter, is_of_instrument
+from afspm.model.positions import PLACES
 
 
 class FormerTargets:

@@ -20,10 +20,7 @@ from afspm.model import (
     is_of_instrument,
     names,
 )
-from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES
-
-PLACES = frozenset((*REGION_CHANGES, *PROBE_CHANGES, *SHAPE_CHANGES))
-"""Parameters that say where to measure."""
+from afspm.model.positions import PLACES
 
 
 class MeasurementSetup:

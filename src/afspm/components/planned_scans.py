@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC
 from typing import Any, Literal
@@ -121,7 +121,10 @@ class PlannedScans(Component):
         self._retakes = Retakes(self.retakes, self.memory)
         self._refused = RefusedPlaces(len(self.plan.regions), self.memory)
         self._verdicts = self.scope.events(tip_verdict.MESSAGE) if self.retakes else None
-        with self.scope.control() if self.keep_control else nullcontext(), self._carried():
+        with (
+            self.scope.control() if self.keep_control else nullcontext(),
+            self.scope.settings(self.parameters, settle=self.settle),
+        ):
             for step in self.plan.steps(done):
                 if not self._await(step, rhythm):
                     break
@@ -139,9 +142,6 @@ class PlannedScans(Component):
         self.log.info("%s taken%s", taken, f"; the time of {left_out} had passed" if left_out else "")
         if self.end_when_done:
             self.scope.end_experiment()
-
-    def _carried(self) -> AbstractContextManager[None]:
-        return self.scope.settings(self.parameters, settle=self.settle)
 
     def _await(self, step: PlanStep, rhythm: RoundSchedule) -> bool:
         if not step.starts_round or self.memory.get("begun") == step.index:

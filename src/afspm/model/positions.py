@@ -27,6 +27,8 @@ REGION_CHANGES: dict[str, Callable[[float], RegionChange]] = {
     names.SCAN_SIZE_Y: lambda value: RegionChange(height_m=value),
     names.SCAN_ANGLE: lambda value: RegionChange(angle_rad=value),
 }
+PLACES = frozenset((*REGION_CHANGES, *PROBE_CHANGES, *SHAPE_CHANGES))
+"""Parameters that say where to measure."""
 
 _CORNER_AND_SIZE = REGION_CHANGES.keys() - {names.SCAN_ANGLE}
 _ANYWHERE = Region((0.0, 0.0), (1.0, 1.0))

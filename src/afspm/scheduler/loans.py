@@ -25,10 +25,7 @@ from dataclasses import dataclass, field
 
 from afspm.basics.frozen import replace, without
 from afspm.basics.units import convert
-from afspm.model import (
-    Parameter,
-    names,
-)
+from afspm.model import Parameter, names
 from afspm.model.requests import LoanInForce, LoansInForce, Setting, amount_text
 
 SETTLES = frozenset(

@@ -29,7 +29,7 @@ from afspm.model import (
     names,
 )
 from afspm.model.microscope_status import STOPS
-from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES
+from afspm.model.positions import PLACES
 from afspm.model.requests import COMPARE_REQUEST, LEND_REQUEST, RETURN_REQUEST, Setting, Settings, amount_text
 from afspm.model.setting_order import widening_first
 from afspm.scheduler.events import RequestIn
@@ -45,7 +45,6 @@ from afspm.wire.messages import LENT_SETTINGS, LOANS
 
 MEASURES = frozenset((names.START_SCAN, names.START_SPEC, names.HOLD_Z, *names.TREATMENTS, *names.APPROACHES))
 """The actions that take place with what was stated for them, and with the base of all else."""
-_PLACES = frozenset((*REGION_CHANGES, *PROBE_CHANGES, *SHAPE_CHANGES))
 _AGAIN_S = 5.0  # real, after a return that could not be made
 COMPARED = "all that the turn compares"
 """The name under which a turn awaits the values in force."""
@@ -84,17 +83,7 @@ def before_returns(draft: StateDraft) -> list[ForwardedRequest]:
 
 
 def refuses_forgotten(draft: StateDraft, job: ForwardedRequest) -> bool:
-    """Refuse a start, once, whose client may have stated something that is not known any more."""
-    if not has_forgotten(draft, job):
-        return False
-    why = "what was stated for this measurement is not known any more: state it again"
-    refusal = Response(int(ControlResponse.NOT_FREE), b"", why, job.request.id, ResponseDetail.STATE_AGAIN)
-    _answer_unsent(draft, job, refusal)
-    return True
-
-
-def has_forgotten(draft: StateDraft, job: ForwardedRequest) -> bool:
-    """Return, once, whether a start may be of a client whose LEND is not known any more, as after a restart."""
+    """Refuse a start, once, whose client may have stated something that is not known any more, as after a restart."""
     is_start = job.request.kind == ControlRequest.ACTION and job.request.subject in MEASURES and not job.is_repeated
     if not is_start or job.client != draft.loans.lent_last:
         return False
@@ -103,6 +92,9 @@ def has_forgotten(draft: StateDraft, job: ForwardedRequest) -> bool:
     if not draft.loans.is_broken:
         return False
     draft.loans = replace(draft.loans, is_broken=False)
+    why = "what was stated for this measurement is not known any more: state it again"
+    refusal = Response(int(ControlResponse.NOT_FREE), b"", why, job.request.id, ResponseDetail.STATE_AGAIN)
+    _answer_unsent(draft, job, refusal)
     return True
 
 
@@ -156,7 +148,7 @@ def _begin(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> None:
     if job.request.kind == RETURN_REQUEST and not may_return(draft):
         _finish(draft, job, Lending())
         return
-    if place := next((one.name for one in _stated(job) if one.name in _PLACES), ""):
+    if place := next((one.name for one in _stated(job) if one.name in PLACES), ""):
         why = f"{place} says where to measure, and is no setting of a measurement: set it before"
         _refuse(draft, job, Response(int(ControlResponse.PARAM_ERROR), b"", why, job.request.id))
         return

@@ -43,7 +43,7 @@ from afspm.model import (
 from afspm.model.geometry import XY
 from afspm.model.microscope_status import STARTS
 from afspm.model.parameter_names import BASE_PARAMETERS, OF_CURVES
-from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES
+from afspm.model.positions import PLACES
 from afspm.model.requests import LEND_REQUEST, RETURN_REQUEST
 from afspm.model.snapshot import to_plain
 from afspm.scheduler.control.arbitration import ArbitrationState, Rules
@@ -63,7 +63,6 @@ _PROBE_M = 5e-9
 _STOPS = frozenset({names.STOP_SCAN, names.STOP_SPEC})
 """Actions that stop a measurement: the holder of control may always send them, and they count as no use of an
 approval."""
-_PLACES = frozenset((*REGION_CHANGES, *SHAPE_CHANGES, *PROBE_CHANGES))
 _OF_SUPERVISORS = frozenset({PROCESSES.name, LOG.name})
 _PARAM = int(ControlRequest.PARAM)
 _SET_REGION, _SET_PROBE = int(ControlRequest.SET_SCAN_PARAMS), int(ControlRequest.SET_PROBE_POS)
@@ -611,7 +610,7 @@ def _part_of_place(request: Request, limits: ExperimentLimits) -> str:
     subject = request.subject.region if isinstance(request.subject, ScanParameters) else request.subject
     if request.kind != _PARAM and not isinstance(subject, RegionChange | PositionChange):
         return ""
-    return min(_PLACES.intersection(LimitChecker(limits).names_set_by(request)), default="")
+    return min(PLACES.intersection(LimitChecker(limits).names_set_by(request)), default="")
 
 
 def _less(held: Mapping[str, HeldGrant], agent: str) -> dict[str, HeldGrant]:
@@ -649,7 +648,7 @@ def _limits_of(grant: Grant) -> ExperimentLimits:
 
 def _others(request: Request, limits: ExperimentLimits) -> list[str]:
     # the parameters that a request sets beside those of the limits; a malformed one has none, and breaks the limits
-    places = _PLACES if limits.region is not None else frozenset()
+    places = PLACES if limits.region is not None else frozenset()
     return [
         name for name in LimitChecker(limits).names_set_by(request) if name not in places | limits.parameters.keys()
     ]
