@@ -171,6 +171,8 @@ class StatusText:
             line = _label("lent").append(loan.text.replace(", lent by", ", by"))
             line.append("; others may have changed it" if loan.is_unsure else "", "yellow")
             yield line.append(f"; not set back: {loan.why}" if loan.why else "", "bold red")
+        for one in self._seen.overruled:
+            yield _label("settings").append(one.text, "yellow")
 
     def _microscope(self) -> Text:
         line, status = _label("microscope"), self._seen.status
@@ -305,6 +307,18 @@ class StatusText:
                     "reason": one.why,
                 }
                 for one in seen.loans
+            ],
+            "overruled": [
+                {
+                    "parameter": one.planned.name,
+                    "states": one.planned.value,
+                    "value": one.value.value,
+                    "unit": one.value.unit,
+                    "component": one.lender,
+                    "by": one.by or None,
+                    "left_in_manual": one.is_asked,
+                }
+                for one in seen.overruled
             ],
             "state": seen.status.state.name if seen.status else None,
             "scan": None if running is None else {"part": round(running[0], 4), "remaining_s": _seconds(running[1])},

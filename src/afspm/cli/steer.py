@@ -35,21 +35,34 @@ def go_on(
         bool,
         typer.Option("--tip-is-clear", help="You have retracted the tip far enough for lateral moves of the sample."),
     ] = False,
+    keep: Annotated[
+        bool, typer.Option("--keep", help="Plans measure with the values that you have set, and not with their own.")
+    ] = False,
+    as_planned: Annotated[
+        bool,
+        typer.Option("--as-planned", help="Plans measure with their own values again."),
+    ] = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Don't ask.")] = False,
 ) -> None:
     """Let a paused experiment continue: AUTOMATED, also after a person has acted at the microscope.
 
-    Shows why it is paused and how the tip is, and then asks. It is refused while the tip is withdrawn, or the feedback
-    off, by hand; `--feedback-off` lets it measure without feedback, until a request of the run or a person switches it
-    on. `--tip-is-clear` allows lateral moves of a stage until the next approach. The experiment must be running: after
-    a kill or a power cut use `afspm run --resume RUN`.
+    Shows why it is paused, how the tip is, and which of your values a plan sets to its own again, and then asks;
+    `--keep` lets the plans measure with yours. It is refused while the tip is withdrawn, or the feedback off, by hand;
+    `--feedback-off` lets it measure without feedback, until a request of the run or a person switches it on.
+    `--tip-is-clear` allows lateral moves of a stage until the next approach. The experiment must be running: after a
+    kill or a power cut use `afspm run --resume RUN`.
     """
     from afspm.model import ControlMode, TipStatus
 
+    if keep and as_planned:
+        raise typer.BadParameter("your values, or those of the plans", param_hint="--keep, --as-planned")
     with looking(where, acts=True) as follower:
         seen = follower.overview
-    if seen.by_hand:
-        typer.echo(f"{seen.by_hand}; now {(seen.tip or TipStatus()).to_continue_with}")
+    left = [one.text for one in seen.overruled if one.is_asked]
+    if seen.by_hand or left:
+        typer.echo(f"{seen.by_hand or 'paused'}; now {(seen.tip or TipStatus()).to_continue_with}")
+        for text in () if keep else left:
+            typer.echo(f"{text}; `--keep` keeps yours")
         if not yes:
             typer.confirm("Let the run continue?", abort=True)
     if feedback_off:
@@ -58,6 +71,9 @@ def go_on(
     if tip_is_clear:
         with acting(where) as scope:
             scope.tip_is_clear()
+    if keep or as_planned:
+        with acting(where) as scope:
+            scope.keep_settings() if keep else scope.as_planned()
     _set_mode(where, ControlMode.AUTOMATED, "the experiment goes on (AUTOMATED)")
 
 

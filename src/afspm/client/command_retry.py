@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from datetime import UTC
 
 from afspm import wire
@@ -27,7 +27,7 @@ from afspm.model import (
 )
 from afspm.model.events import MeasurementSettings
 from afspm.model.microscope_status import feedback_of
-from afspm.model.requests import LEND_REQUEST, RETURN_REQUEST, Settings
+from afspm.model.requests import LEND_REQUEST, RETURN_REQUEST, Setting, Settings
 from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S
 from afspm.wire.messages import FEEDBACK, LENT_SETTINGS
 
@@ -161,15 +161,23 @@ class CommandRetry:
         return wire.decode_parameter(response.payload) if response.payload else wanted
 
     def lend(
-        self, wanted: Sequence[Parameter], until_s: float | None, settle_s: float | None = None
+        self,
+        wanted: Sequence[Parameter],
+        until_s: float | None,
+        settle_s: float | None = None,
+        swept: Collection[str] = (),
     ) -> dict[str, Parameter]:
         """Set what the next measurement states, and return the values in force by name. Control must be held.
 
         The scheduler sets the former values back for measurements that do not state them. Raises as `ask`.
+
+        Args:
+            swept: the parameters that are points of a sweep: no person's value takes the place of theirs.
         """
+        settings = tuple(Setting(one, is_swept=one.name in swept) for one in wanted)
         if self._lends:
             try:
-                response = self.ask(LEND_REQUEST, Settings.of(*wanted, settle_s=settle_s), until_s=until_s)
+                response = self.ask(LEND_REQUEST, Settings(settings, settle_s), until_s=until_s)
             except Refused as refusal:
                 if refusal.response != ControlResponse.CMD_NOT_SUPPORTED:
                     raise

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from afspm.basics.errors import ControlLost, NotClear
 from afspm.client.command_retry import CommandRetry
 from afspm.client.control_hold import ControlHold
@@ -88,7 +90,8 @@ class MeasurementSetup:
                 self._commands.ask(ControlRequest.PARAM, Parameter(names.SPEC_KIND, target.kind), until_s=until_s)
             if target.at_m is not None:
                 self.move_probe(target.at_m, until_s)
-        in_force = self.lend(target.lent, target.settings, until_s, target.settle_s)
+        swept = () if target.point is None else tuple(one.name for one in target.settings)
+        in_force = self.lend(target.lent, target.settings, until_s, target.settle_s, swept)
         if target.settings:
             shown = (in_force[one.name] for one in target.settings if one.name in in_force)
             self._commands.publish_settings((*reached, *shown), key, target.point)
@@ -99,11 +102,13 @@ class MeasurementSetup:
         own: tuple[Parameter, ...],
         until_s: float | None,
         settle_s: float | None = None,
+        swept: Collection[str] = (),
     ) -> dict[str, Parameter]:
         """State settings for the next measurement, and return those in force by name.
 
         Args:
             of_block: of the enclosing blocks, which `own` ones come before.
+            swept: the parameters that are points of a sweep.
         """
         decided = self._commands.decided
         of_block = () if self.holds_z else tuple(one for one in of_block if one.name not in decided)
@@ -113,7 +118,7 @@ class MeasurementSetup:
         wanted = {name: one for name, one in wanted.items() if name not in places}
         # what was stated for a measurement that did not begin must not hold for this one
         is_needed = bool(wanted) or (self._commands.states and not self.holds_z)
-        lent = self._commands.lend(tuple(wanted.values()), until_s, settle_s) if is_needed else {}
+        lent = self._commands.lend(tuple(wanted.values()), until_s, settle_s, swept) if is_needed else {}
         return {**places, **lent}
 
     def move_probe(self, xy_m: XY, until_s: float | None, *, drifts: bool = False) -> None:

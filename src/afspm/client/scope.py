@@ -56,6 +56,7 @@ from afspm.model import (
 from afspm.model.curve_request import CurveSettings, curve_parameters
 from afspm.model.events import HasTime
 from afspm.model.instruments import InstrumentOrders, is_of_instrument, newest_of
+from afspm.model.requests import AS_PLANNED_REQUEST, KEEP_REQUEST, Settings
 from afspm.model.sessions import KEYED
 from afspm.model.sweep_plan import SweepAxis, SweepOrder, SweepPlan, SweptValues
 from afspm.transport.process.parent import StopRequested
@@ -226,8 +227,9 @@ class Scope(ExperimentView):
         except (ExperimentEnded, StopRequested):
             raise  # the scheduler has noticed, or a stop of the run leaves them to a person
         except BaseException:  # also Ctrl-C, and what the block of the user raises
-            with suppress(RequestError, ExperimentEnded), self._link.interrupts.deferred():
-                self._commands.give_back(sorted(names), self._link.until(SET_BACK_WITHIN_S))
+            if names:
+                with suppress(RequestError, ExperimentEnded), self._link.interrupts.deferred():
+                    self._commands.give_back(sorted(names), self._link.until(SET_BACK_WITHIN_S))
             raise
         if names:
             with self._call():
@@ -698,6 +700,27 @@ class Scope(ExperimentView):
             Refused: the mode is not MANUAL, or this client speaks for no person with the role `approve`.
         """
         self._say(names.FEEDBACK_MAY_BE_OFF, timeout_s)
+
+    @checked_call
+    def keep_settings(self, *parameters: str) -> None:
+        """Let plans measure with the values that a person has set in MANUAL; without parameters, with all of them.
+
+        A plan that states another value measures with the one left, until it ends or `as_planned` is called. Without
+        this call it sets its own again.
+
+        Raises:
+            Refused: the mode is not MANUAL, or this client is an agent.
+        """
+        self._ask_scheduler(KEEP_REQUEST, Settings.of(*map(Parameter, parameters)))
+
+    @checked_call
+    def as_planned(self, *parameters: str) -> None:
+        """Let plans measure with the values that they state, in spite of what a person or a solver has decided.
+
+        Raises:
+            Refused: this client is an agent.
+        """
+        self._ask_scheduler(AS_PLANNED_REQUEST, Settings.of(*map(Parameter, parameters)))
 
     def _say(self, action: str, timeout_s: float | None) -> None:
         with self._call():

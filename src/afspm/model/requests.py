@@ -67,6 +67,16 @@ The subject is `Settings` without values; without settings, all that the client 
 """
 COMPARE_REQUEST = 108
 """Request of the scheduler to a translator: which of the known values are in force; an extension of afspm."""
+KEEP_REQUEST = 109
+"""Request of a person: the plans measure with the values that were set in MANUAL; an extension of afspm.
+
+The subject is `Settings` without values; without settings, all values that a plan would set again.
+"""
+AS_PLANNED_REQUEST = 110
+"""Request of a person: the plans measure with the values of their file again; an extension of afspm.
+
+The subject is the same as for `KEEP_REQUEST`.
+"""
 
 OTHER_RUN_RESPONSE = 100
 """Response to a component of another run than the scheduler's run; an extension of afspm."""
@@ -80,6 +90,8 @@ _OURS = {
     LEND_REQUEST: "LEND",
     RETURN_REQUEST: "RETURN",
     COMPARE_REQUEST: "COMPARE",
+    KEEP_REQUEST: "KEEP",
+    AS_PLANNED_REQUEST: "AS_PLANNED",
 }
 
 
@@ -148,12 +160,14 @@ class Setting:
             precision.
         is_claimed: whether the next measurement stands for the first of `known`, if that is in force.
         is_lent: in an answer, whether the parameter may be lent; None: unknown to the translator.
+        is_swept: to lend: whether it is a point of a sweep, which no other value takes the place of.
     """
 
     parameter: Parameter
     known: tuple[Parameter, ...] = ()
     is_claimed: bool = False
     is_lent: bool | None = None
+    is_swept: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,10 +213,37 @@ class LoanInForce:
 
 
 @dataclass(frozen=True, slots=True)
+class Overruling:
+    """A value that takes the place of one that a plan states.
+
+    Attributes:
+        planned: as the plan states it.
+        value: with which the plan measures instead.
+        by: who decided it.
+        is_asked: whether a person has left it in MANUAL: the plan sets its own again unless it is kept.
+    """
+
+    lender: str
+    planned: Parameter
+    value: Parameter
+    by: str
+    is_asked: bool = False
+
+    @property
+    def text(self) -> str:
+        """It as text for people: "a measures at tip-bias-voltage 700 mV, set at the microscope; it states 500 mV"."""
+        value, planned = amount_text(self.value), amount_text(self.planned)
+        if self.is_asked:
+            return f"{self.lender} sets {self.planned.name} {planned} again (you left {value})"
+        return f"{self.lender} measures at {self.value.name} {value}, set {self.by}; it states {planned}"
+
+
+@dataclass(frozen=True, slots=True)
 class LoansInForce:
-    """All that the scheduler has lent; without any, all settings are those of before."""
+    """All that the scheduler has lent, without which all settings are those of before; and what overrules plans."""
 
     loans: tuple[LoanInForce, ...] = ()
+    overruled: tuple[Overruling, ...] = ()
 
 
 def amount_text(parameter: Parameter) -> str:

@@ -51,7 +51,7 @@ from afspm.model.events import PERSON, LogLines
 from afspm.model.grants import with_proposal
 from afspm.model.parameter_names import START_SCAN
 from afspm.model.problems import CONDITIONS
-from afspm.model.requests import LoanInForce, LoansInForce
+from afspm.model.requests import LoanInForce, LoansInForce, Overruling
 from afspm.night.expected_end import Plans, expected_end_ns
 from afspm.night.measurement_history import (
     SOON_NS,
@@ -179,6 +179,7 @@ class Overview:
         proposals: the proposals of agents by id, newest last, bounded.
         approvals: the approvals in force.
         loans: the settings that are in force for one component's measurements.
+        overruled: the values that take the place of stated ones, and what a person has left in MANUAL.
         of_conditions: the numbers of the problems flagged by conditions.
         set_ns: the time of the last accepted request that set each parameter.
         log, alarms, notes, entries, refusals, acts: newest last, bounded; acts are those at the microscope itself.
@@ -209,6 +210,7 @@ class Overview:
         self.proposals: dict[str, Proposal] = {}
         self.approvals = Approvals()
         self.loans: tuple[LoanInForce, ...] = ()
+        self.overruled: tuple[Overruling, ...] = ()
         self._approved_ns: dict[str, int] = {}
         self.of_conditions: set[int] = set()
         self.set_ns: dict[str, int] = {}
@@ -473,7 +475,7 @@ class Overview:
         self._approved_ns |= {one.plan: time_ns for one in approvals.approvals if one.plan}
 
     def _on_loans(self, loans: LoansInForce, time_ns: int) -> None:
-        self.loans = loans.loans
+        self.loans, self.overruled = loans.loans, loans.overruled
 
     def _on_control(self, control: ControlState, time_ns: int) -> None:
         self.control = control

@@ -26,7 +26,7 @@ from dataclasses import dataclass, field
 from afspm.basics.frozen import replace, without
 from afspm.basics.units import convert
 from afspm.model import Parameter, names
-from afspm.model.requests import LoanInForce, LoansInForce, Setting, amount_text
+from afspm.model.requests import LoanInForce, LoansInForce, Setting
 
 SETTLES = frozenset(
     (names.TIP_BIAS_VOLTAGE, names.SAMPLE_BIAS, names.ZCTRL_SETPOINT, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN)
@@ -48,6 +48,7 @@ class Loan:
         before: the value in force before `value` was sent, until it is answered; None: it is.
         is_over: whether it is set back as soon as possible.
         is_unsure: whether others may have changed the value since it was lent.
+        is_watched: whether the run was AUTOMATED and in contact since: another value is then a person's.
         why: why it could not be set back; empty: nothing is known against it.
     """
 
@@ -58,6 +59,7 @@ class Loan:
     before: Parameter | None = None
     is_over: bool = False
     is_unsure: bool = False
+    is_watched: bool = True
     why: str = ""
 
     @property
@@ -101,11 +103,12 @@ class LoanBook:
     @classmethod
     def restored(cls, loans: Mapping[str, Loan], lent_last: str) -> LoanBook:
         """Return the book after a restart, which others may have used to act."""
-        return cls(loans, lent_last=lent_last, shown=None if lent_last else _NONE)
+        unwatched = {key: replace(loan, is_watched=False) for key, loan in loans.items()}
+        return cls(unwatched, lent_last=lent_last, shown=None if lent_last else _NONE)
 
     @property
-    def in_force(self) -> LoansInForce:
-        return LoansInForce(tuple(loan.in_force for loan in self.loans.values()))
+    def in_force(self) -> tuple[LoanInForce, ...]:
+        return tuple(loan.in_force for loan in self.loans.values())
 
     def of_kind(self, kind: str) -> Iterator[tuple[str, Loan]]:
         """Yield the loans whose value can be read now, with their keys."""
@@ -124,29 +127,25 @@ class LoanBook:
         """Return the keys of the loans to be set back as soon as possible, newest first."""
         return [key for key, loan in self.loans.items() if loan.is_over][::-1]
 
-    def compared(self, settings: Mapping[str, Setting], kind: str) -> tuple[LoanBook, list[str]]:
-        """Return the book after a look at the values in force, with a sentence for each value that others have set.
+    def compared(self, settings: Mapping[str, Setting], kind: str) -> tuple[LoanBook, dict[str, Loan]]:
+        """Return the book after a look at the values in force, with the loans, by key, whose value others have changed.
 
         Args:
             settings: the translator's answers by name: a loan is looked at if its lent value or base was asked for.
         """
-        book, notes = self, list[str]()
+        book, changed = self, dict[str, Loan]()
         for key, loan in self.of_kind(kind):
             if (found := settings.get(loan.name)) is None:
                 continue
             there = next((one for one in (loan.value, loan.before) if one in found.known), None)
             if there is not None:
-                sure = replace(loan, value=there, before=None, is_unsure=False)
+                sure = replace(loan, value=there, before=None, is_unsure=False, is_watched=True)
                 book = book if sure == loan else book._with(key, sure)
                 continue
             book = replace(book, loans=without(book.loans, key))
             if loan.base not in found.known:
-                now = amount_text(found.parameter)
-                notes.append(
-                    f"{loan.name} reads {now}, and not the {amount_text(loan.value)} that {loan.lender} has lent it: "
-                    f"{now} is its base from now on, where {amount_text(loan.base)} was"
-                )
-        return book, notes
+                changed[key] = loan
+        return book, changed
 
     def sending(self, key: str, now: Parameter, value: Parameter, lender: str, kind: str) -> LoanBook:
         """Return the book with a value that is about to be sent, or in force; the base of an earlier loan stays.
@@ -171,7 +170,7 @@ class LoanBook:
 
     def broken(self) -> LoanBook:
         """Return the book after a restart, or a lost connection: a client may rely on what it has stated before."""
-        return replace(self.nothing_stated().unsure(), is_broken=bool(self.lent_last))
+        return replace(self.nothing_stated().unsure(is_watched=False), is_broken=bool(self.lent_last))
 
     def in_state(self, *, is_free: bool, now_ns: int) -> LoanBook:
         """Return the book after a published state of the microscope."""
@@ -182,7 +181,11 @@ class LoanBook:
     def answered(self, key: str, value: Parameter) -> LoanBook:
         """Return the book with the value that the microscope has answered."""
         loan = self.loans.get(key)
-        return self if loan is None else self._with(key, replace(loan, value=value, before=None, is_unsure=False))
+        return (
+            self
+            if loan is None
+            else self._with(key, replace(loan, value=value, before=None, is_unsure=False, is_watched=True))
+        )
 
     def gone(self, keys: Iterable[str]) -> LoanBook:
         left = {key: loan for key, loan in self.loans.items() if key not in set(keys)}
@@ -212,11 +215,17 @@ class LoanBook:
             return self
         return self._with(key, replace(loan, value=loan.before or loan.value, before=None, is_unsure=True, why=why))
 
-    def unsure(self) -> LoanBook:
-        """Return the book when others may have acted: each value is read before anything follows from it."""
-        if all(loan.is_unsure for loan in self.loans.values()):
-            return self
-        return replace(self, loans={key: replace(loan, is_unsure=True) for key, loan in self.loans.items()})
+    def unsure(self, *, is_watched: bool) -> LoanBook:
+        """Return the book when others may have acted: each value is read before anything follows from it.
+
+        Args:
+            is_watched: whether a person has acted in AUTOMATED.
+        """
+        loans = {
+            key: replace(loan, is_unsure=True, is_watched=loan.is_watched and is_watched)
+            for key, loan in self.loans.items()
+        }
+        return self if loans == self.loans else replace(self, loans=loans)
 
     def used(self, now_ns: int) -> LoanBook:
         """Return the book after a request for settings: the microscope is idle since then."""

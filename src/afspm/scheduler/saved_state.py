@@ -12,6 +12,7 @@ from afspm.model.microscope_status import TipRisk
 from afspm.scheduler.control.arbitration import ArbitrationState
 from afspm.scheduler.control.panel_state import PanelState
 from afspm.scheduler.loans import Loan
+from afspm.scheduler.overrulings import PlanBook
 from afspm.scheduler.publishing.event_log import SentStart
 from afspm.scheduler.safety.grants import GrantBook
 from afspm.scheduler.safety.limit_state import LimitState
@@ -52,6 +53,7 @@ class SavedState:
         instrument_orders: the number of the newest order or token.
         loans: the settings that were lent, by key.
         lent_last: see `loans.LoanBook`.
+        plans: what components state, and what takes the place of it.
         given_orders: the orders that may still be carried out, or whose value is on its way.
     """
 
@@ -76,6 +78,7 @@ class SavedState:
     panel: PanelState = field(default_factory=PanelState)
     loans: Mapping[str, Loan] = field(default_factory=dict)
     lent_last: str = ""
+    plans: PlanBook = field(default_factory=PlanBook)
 
     def without_holder(self) -> SavedState:
         """Return the state without a holder: an older state does not know the present holder."""

@@ -52,7 +52,8 @@ class ControlSettings:
         stopped_by_hand: what follows a person's stop of a measurement at the microscope. `"pause"`: the mode becomes
             MANUAL, until a person lets the run continue; `"repeat"`: it is measured again.
         changed_by_hand: what follows a person's change of a setting at the microscope. `"tell"`: it is logged, and
-            kept; `"pause"`: the mode becomes MANUAL, as it always does for a value outside `[limits]`.
+            kept, also by a plan that states the parameter; `"pause"`: the mode becomes MANUAL, as it always does for
+            a value outside `[limits]`.
         retract: whether to retract the tip, if the microscope can, when a holder loses control in a dangerous state.
             The tip is not retracted when the holder gives control back, or a person takes control.
         dangerous: list of the dangerous states: `MOVING`, `SCANNING`, `COARSE_MOTOR`, `BUSY_PARAM`, `SPEC`,

@@ -20,6 +20,7 @@ from afspm.scheduler.coordinate_frame import TIP_FRAME, CoordinateFrame
 from afspm.scheduler.events import Codec, Effect, FrameAnswered, Log, SaveState
 from afspm.scheduler.instruments.known_instruments import Instruments
 from afspm.scheduler.loans import LoanBook
+from afspm.scheduler.overrulings import PlanBook
 from afspm.scheduler.publishing.cache import PacketCache
 from afspm.scheduler.publishing.event_log import EventLog
 from afspm.scheduler.requests.forwarder import Forwarder
@@ -83,6 +84,7 @@ class SchedulerState:
     frame: CoordinateFrame
     grants: GrantChecker
     loans: LoanBook
+    plans: PlanBook
 
     @classmethod
     def initial(cls, settings: SchedulerSettings, frame: CoordinateFrame = TIP_FRAME) -> SchedulerState:
@@ -110,6 +112,7 @@ class SchedulerState:
             frame=frame,
             grants=GrantChecker(settings.rules, settings.limits, settings.run.name),
             loans=LoanBook(),
+            plans=PlanBook(),
         )
 
     def saved_parts(self) -> tuple[object, ...]:
@@ -127,6 +130,8 @@ class SchedulerState:
             self.instruments.given,
             self.loans.loans,
             self.loans.lent_last,
+            self.plans.stated,
+            self.plans.overruled,
         )
 
     def due_s(self) -> float | None:
@@ -181,6 +186,7 @@ class StateParts:
     frame: CoordinateFrame
     grants: GrantChecker
     loans: LoanBook
+    plans: PlanBook
 
 
 _PARTS = tuple(one.name for one in fields(SchedulerState))
@@ -210,10 +216,12 @@ class StateDraft(StateParts):
         """Save the state after this step even if none of its `saved_parts` changed."""
         self._is_to_be_saved = True
 
-    def others_may_have_acted(self, *, unseen: bool = False, by: str = "") -> None:
+    def others_may_have_acted(self, *, unseen: bool = False, by: str = "", is_watched: bool = False) -> None:
         """Forget where the tip and its motor are, and which settings are in force.
 
-        The arguments are those of `MoverState.unknown`.
+        Args:
+            unseen, by: see `MoverState.unknown`.
+            is_watched: whether a person has acted in AUTOMATED.
         """
         shown, said_s = self.panel.tip.engaged, self.limits.state.movers.cleared_s
         by = by if self.now_s - said_s < _WORD_S else ""
@@ -221,7 +229,7 @@ class StateDraft(StateParts):
         if shown is not False:
             self.microscope = self.microscope.with_tip(away=False)
         self.instruments = self.instruments.changed(self.now_s)
-        self.loans = self.loans.broken() if unseen else self.loans.unsure()
+        self.loans = self.loans.broken() if unseen else self.loans.unsure(is_watched=is_watched)
 
     def log(self, level: str, text: str) -> None:
         self.effects.append(Log(level, text))
@@ -268,6 +276,7 @@ def saved_state(state: SchedulerState, env: Environment) -> SavedState:
         panel=state.panel,
         loans=state.loans.loans,
         lent_last=state.loans.lent_last,
+        plans=replace(state.plans, measured="", bases={}, found={}),
     )
 
 
@@ -304,4 +313,5 @@ def restored_state(
         grants=replace(state.grants, book=saved.grants),
         panel=saved.panel,
         loans=LoanBook.restored(saved.loans, saved.lent_last),
+        plans=saved.plans,
     )

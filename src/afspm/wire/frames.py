@@ -26,7 +26,14 @@ from afspm.model import (
     ResponseDetail,
     request_name,
 )
-from afspm.model.requests import COMPARE_REQUEST, LEND_REQUEST, LONGEST_LEASE_S, RETURN_REQUEST
+from afspm.model.requests import (
+    AS_PLANNED_REQUEST,
+    COMPARE_REQUEST,
+    KEEP_REQUEST,
+    LEND_REQUEST,
+    LONGEST_LEASE_S,
+    RETURN_REQUEST,
+)
 from afspm.wire import unit_conversion
 from afspm.wire.codec import encode
 from afspm.wire.generated import control_pb2, scan_pb2, spectroscopy_pb2
@@ -259,5 +266,7 @@ _SUBJECTS: dict[int, Callable[[bytes], object]] = {
     LEND_REQUEST: SETTINGS.decode,
     RETURN_REQUEST: SETTINGS.decode,
     COMPARE_REQUEST: SETTINGS.decode,
+    KEEP_REQUEST: SETTINGS.decode,
+    AS_PLANNED_REQUEST: SETTINGS.decode,
     ControlRequest.ACTION_SUPPORT: _action,
 }

@@ -19,7 +19,7 @@ from afspm.basics.errors import InvalidValue
 from afspm.model.events import LogLines, MeasurementSettings
 from afspm.model.instruments import InstrumentOrders
 from afspm.model.panel import ChangedValue
-from afspm.model.requests import LoanInForce, LoansInForce, Setting, Settings
+from afspm.model.requests import LoanInForce, LoansInForce, Overruling, Setting, Settings
 from afspm.model.state import FeedbackUnits
 from afspm.model.variables import VariableRoles
 from afspm.wire.generated import (
@@ -284,6 +284,7 @@ _SETTING = MessageMapping(
     known=_each("known", PARAMETER),
     is_claimed=FieldMapping("claimed", sparse=True),
     is_lent="lent",
+    is_swept=FieldMapping("swept", sparse=True),
 )
 SETTINGS = MessageMapping(
     Settings,
@@ -299,6 +300,14 @@ _LOAN = MessageMapping(
     lender="lender",
     is_unsure=FieldMapping("unsure", sparse=True),
     why=FieldMapping("reason", sparse=True),
+)
+_OVERRULING = MessageMapping(
+    Overruling,
+    loans_pb2.Overruling,
+    *("lender", "by"),
+    planned=FieldMapping("planned", PARAMETER.to_wire, PARAMETER.from_wire),
+    value=FieldMapping("value", PARAMETER.to_wire, PARAMETER.from_wire),
+    is_asked=FieldMapping("asked", sparse=True),
 )
 _COUNT = MessageMapping(model.GrantedCount, grants_pb2.GrantedCount, "action", "count")
 _RANGE = MessageMapping(model.GrantedRange, grants_pb2.GrantedRange, "parameter", "low", "high")
@@ -414,7 +423,9 @@ MAPPINGS: tuple[MessageMapping[Any], ...] = (
     _NOTE,
     _SWEPT,
     SETTINGS,
-    MessageMapping(LoansInForce, loans_pb2.Loans, loans=_each("loans", _LOAN)),
+    MessageMapping(
+        LoansInForce, loans_pb2.Loans, loans=_each("loans", _LOAN), overruled=_each("overruled", _OVERRULING)
+    ),
     MessageMapping(
         model.InstrumentReadings,
         instruments_pb2.InstrumentReadings,

@@ -80,7 +80,8 @@ def sent_by_requests(run: AfspmRun) -> list[str]:
 
 
 def go_on(run: AfspmRun) -> subprocess.CompletedProcess[str]:
-    command = [*AFSPM, "continue", str(run.folder), "--yes"]
+    """Let the run continue at the speed that was set at the panel, which its plan states otherwise."""
+    command = [*AFSPM, "continue", str(run.folder), "--yes", "--keep"]
     return subprocess.run(command, capture_output=True, encoding="utf-8", timeout=DEADLINE_S, check=False)
 
 
@@ -128,6 +129,7 @@ def act(run: AfspmRun, do: Callable[[Client], object]) -> None:
         assert not scope.control_state.problems
         with panel(run) as client:
             set_speed(client, 1e-6)
+        run.wait_for("set at the microscope: scan-speed")
 
 
 def test_nothing_is_sent_after_a_stop_until_a_person_lets_the_run_continue(run: AfspmRun) -> None:
@@ -139,6 +141,7 @@ def test_nothing_is_sent_after_a_stop_until_a_person_lets_the_run_continue(run: 
     found = afspm.open_run(run.folder)
     assert sorted(row.interrupted for row in found.scans) == [False, False, False, True]
     assert not run.said("device-malfunction")
+    assert run.said("series measures at scan-speed 1 µm/s, set by terminal:")
 
 
 def test_tip_withdrawn_in_a_scan_is_measured_with_only_after_it_is_back(run: AfspmRun) -> None:

@@ -523,7 +523,7 @@ def test_settings_left_by_hand_are_logged_when_the_mode_is_automated() -> None:
         lab.mode("console", ControlMode.AUTOMATED)
         return [one.text for one in lab.effects if isinstance(one, Log) and "by hand" in one.text]
 
-    assert said() == ["set by hand, and still in force: tip-bias-voltage = 0.5 V, setpoint = 2e-09"]
+    assert said() == ["set by hand, and still in force: tip-bias-voltage = 500 mV, setpoint = 2e-09"]
     lab.mode("console", ControlMode.MANUAL)
     assert len(said()) == 1  # told once, and nothing was set this time
 

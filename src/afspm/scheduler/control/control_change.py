@@ -116,7 +116,13 @@ def _carry_out(draft: StateDraft, change: _Change) -> None:
     entries = control_entries(draft.now_ns, before, after, change.ask, change.row, problems)
     draft.event_log = draft.event_log.add(draft.now_s, *entries)
     draft.lease = draft.lease.held_by(after.holder, draft.now_ns)
+    solved = before.problems.keys() - after.problems.keys()
+    if before.solving in solved and change.ask.who == before.holder:
+        draft.plans, notes = draft.plans.solved(change.ask.who)
+        for note in notes:
+            draft.log("WARNING", note)
     if before.holder != after.holder:
+        draft.plans = draft.plans.unsolved()
         draft.loans = draft.loans.nothing_stated()
         if after.solving:  # a repair, and what judges it, takes place at the base
             others = [key for key, loan in draft.loans.loans.items() if loan.lender != after.holder]

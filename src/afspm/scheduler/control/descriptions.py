@@ -37,7 +37,7 @@ from afspm.model import (
     request_name,
 )
 from afspm.model.panel import ChangedValue
-from afspm.model.requests import LEND_REQUEST, RETURN_REQUEST, Settings
+from afspm.model.requests import AS_PLANNED_REQUEST, KEEP_REQUEST, LEND_REQUEST, RETURN_REQUEST, Settings
 from afspm.model.scan import ShapeChange
 from afspm.scheduler.control.arbitration import (
     ArbitrationEvent,
@@ -106,13 +106,13 @@ class HandSettings:
     """Settings changed in MANUAL mode, by requests or at the panel.
 
     Attributes:
-        parameters: value with its unit, by name.
+        parameters: the values by name.
         at_panel: for each parameter changed only at the panel, its value when MANUAL began.
         before: the feedback in force when MANUAL began; None: not known.
         now: the feedback in force; None: not known.
     """
 
-    parameters: Mapping[str, str] = field(default_factory=dict)
+    parameters: Mapping[str, Parameter] = field(default_factory=dict)
     at_panel: Mapping[str, str] = field(default_factory=dict)
     before: Feedback | None = None
     now: Feedback | None = None
@@ -122,15 +122,14 @@ class HandSettings:
         parameter = request.subject
         if not isinstance(parameter, Parameter) or parameter.value is None:
             return self
-        value = f"{parameter.value} {parameter.unit or ''}".rstrip()
-        return replace(self, parameters={**self.parameters, parameter.name: value})
+        return replace(self, parameters={**self.parameters, parameter.name: parameter})
 
     def changed(self, change: ChangedValue) -> HandSettings:
         """Add a setting changed at the panel in MANUAL mode; remove it if it has its first value again."""
         name, at_panel = change.parameter, self.at_panel
         if name not in self.parameters:
             at_panel = {**at_panel, name: at_panel.get(name, change.before)}
-        parameters = {**self.parameters, name: _value(change.after, change.unit)}
+        parameters = {**self.parameters, name: Parameter(name, change.after, change.unit or None)}
         if at_panel.get(name) == change.after:
             del parameters[name]
         return replace(self, parameters=parameters, at_panel=at_panel)
@@ -140,7 +139,7 @@ class HandSettings:
 
     def handed_back(self) -> tuple[HandSettings, tuple[str, ...]]:
         """Return emptied settings, and the text of each setting that stays in force after MANUAL."""
-        told = [f"{name} = {value}" for name, value in self.parameters.items()]
+        told = [f"{name} = {_value(one.value or '', one.unit or '')}" for name, one in self.parameters.items()]
         for name, (word, parameter) in _FEEDBACK_WORDS.items():
             value = getattr(self.now, name, None)
             is_changed = value is not None and value != getattr(self.before, name, None)
@@ -258,4 +257,6 @@ _WORDS: dict[int, Callable[[Any, ProblemNames], str]] = {
     RESTART_REQUEST: lambda subject, problems: f"restart {subject}",
     LEND_REQUEST: _settings,
     RETURN_REQUEST: _returned,
+    KEEP_REQUEST: lambda subject, problems: "keeps what was set in MANUAL",
+    AS_PLANNED_REQUEST: lambda subject, problems: "lets the plans measure with the values of their file",
 }

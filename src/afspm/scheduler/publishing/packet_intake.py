@@ -107,9 +107,9 @@ def _update_state(draft: StateDraft, published: object) -> None:
 
 
 def _take_act(draft: StateDraft, act: ActByHand) -> None:
-    draft.others_may_have_acted()
-    draft.limits = draft.limits.seen(Parameter(one.parameter, one.after, one.unit or None) for one in act.changes)
     is_manual = draft.control.mode is ControlMode.MANUAL
+    draft.others_may_have_acted(is_watched=not is_manual)
+    draft.limits = draft.limits.seen(Parameter(one.parameter, one.after, one.unit or None) for one in act.changes)
     for one in act.changes:
         if is_manual:
             draft.by_hand = draft.by_hand.changed(one)

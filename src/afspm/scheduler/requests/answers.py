@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from afspm.basics.frozen import replace
-from afspm.model import ControlResponse, Request, Response, ResponseDetail
+from afspm.model import ControlResponse, Parameter, Request, Response, ResponseDetail, names
 from afspm.model.idempotency_cache import RequestStatus
 from afspm.scheduler.control.arbitration import Cause
 from afspm.scheduler.events import Reply, RequestIn
@@ -65,6 +67,43 @@ def log_refusal(draft: StateDraft, client: str, refusal: Response) -> None:
     draft.log("WARNING" if refusal.again_ns is None else "INFO", f"refused {client}: {refusal.reason}")
     if refusal.again_ns is not None and client == draft.control.holder:
         draft.lease = draft.lease.waiting(refusal.again_ns)
+
+
+def with_alias(draft: StateDraft, request: Request, refusal: Response) -> Response:
+    """Return a refusal that also has the client's own name of the bias."""
+    if not (alias := request.alias):
+        return refusal
+    sign = "-" if draft.env.settings.limits.bias.sign < 0 else ""
+    return replace(refusal, reason=f"{refusal.reason}; here {alias} is {sign}{names.TIP_BIAS_VOLTAGE}")
+
+
+def refusal_for_second_electrode(request: Request, values: Mapping[str, Parameter | None]) -> Response | None:
+    """Refuse a bias of the sample that is not the whole voltage; None: it is.
+
+    Args:
+        values: the values in force by name; a microscope without a second electrode has none.
+    """
+    if not request.alias or names.SAMPLE_BIAS not in values:
+        return None
+    volts = "no value" if (found := values[names.SAMPLE_BIAS]) is None else f"{found.value} {found.unit or 'V'}"
+    try:
+        if found is not None and float(found.value or "nan") == 0.0:
+            return None
+    except ValueError:
+        pass
+    why = (
+        f"{request.alias} is the whole voltage only while the second electrode is at 0 V, and "
+        f"{names.SAMPLE_BIAS} reads {volts}: set it to 0 V, or set {names.TIP_BIAS_VOLTAGE}"
+    )
+    return Response(int(ControlResponse.PARAM_ERROR), b"", why, request.id)
+
+
+def take_off(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
+    """Answer a waiting request that is not sent, and end its turn."""
+    draft.forwarder = draft.forwarder.without(job.number)
+    if job.command:
+        draft.pending = replace(draft.pending, turn=None)
+    answer_unsent(draft, job, response)
 
 
 def finish(draft: StateDraft, job: ForwardedRequest, response: Response, status: RequestStatus | None = None) -> None:

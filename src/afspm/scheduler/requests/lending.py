@@ -21,6 +21,7 @@ from afspm.model import (
     ControlMode,
     ControlRequest,
     ControlResponse,
+    Feedback,
     Parameter,
     Problem,
     Request,
@@ -30,10 +31,20 @@ from afspm.model import (
 )
 from afspm.model.microscope_status import STOPS
 from afspm.model.positions import PLACES
-from afspm.model.requests import COMPARE_REQUEST, LEND_REQUEST, RETURN_REQUEST, Setting, Settings, amount_text
+from afspm.model.requests import (
+    COMPARE_REQUEST,
+    KEEP_REQUEST,
+    LEND_REQUEST,
+    RETURN_REQUEST,
+    LoansInForce,
+    Overruling,
+    Setting,
+    Settings,
+    amount_text,
+)
 from afspm.model.setting_order import widening_first
 from afspm.scheduler.events import RequestIn
-from afspm.scheduler.loans import SETTLES, LoanBook, equal, key_of, kind_of, may_be_lent
+from afspm.scheduler.loans import SETTLES, Loan, LoanBook, equal, key_of, kind_of, may_be_lent
 from afspm.scheduler.publishing.event_log import SCHEDULER
 from afspm.scheduler.publishing.own_packets import publish
 from afspm.scheduler.requests import answers, approvals
@@ -65,7 +76,10 @@ def takes_turn(draft: StateDraft, job: ForwardedRequest) -> bool:
 
 def take_return(draft: StateDraft, event: RequestIn) -> bool:
     """Process a RETURN; return whether it is queued, and answered once all is set back."""
-    draft.loans = draft.loans.returned_by(event.name, [one.name for one in event.request.subject.parameters])
+    given = [one.name for one in event.request.subject.parameters]
+    draft.loans = draft.loans.returned_by(event.name, given)
+    if not given:
+        draft.plans = draft.plans.ended(event.name)
     if is_to_return(draft.loans) and may_return(draft):
         return True
     answers.answer(draft, event, ControlResponse.SUCCESS)
@@ -148,19 +162,19 @@ def _begin(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> None:
     if job.request.kind == RETURN_REQUEST and not may_return(draft):
         _finish(draft, job, Lending())
         return
-    if place := next((one.name for one in _stated(job) if one.name in PLACES), ""):
+    stated = _stated(draft, job, draft.limits.kind_of_curve)
+    if place := next((one.name for one in stated if one.name in PLACES), ""):
         why = f"{place} says where to measure, and is no setting of a measurement: set it before"
         _refuse(draft, job, Response(int(ControlResponse.PARAM_ERROR), b"", why, job.request.id))
         return
     draft.loans = draft.loans.used(draft.now_ns)
-    asked = _to_compare(draft, job)
+    asked = _to_compare(draft, stated)
     if not asked:
         _finish(draft, job, Lending())
         return
-    wanted = {one.name: one for one in _stated(job)}
-    possible = [*wanted.values(), *(loan.base for loan in draft.loans.loans.values())]
+    possible = [*stated, *(loan.base for loan in draft.loans.loans.values())]
     others = [name for one in possible for name in draft.limits.depends_on(Request(int(ControlRequest.PARAM), one))]
-    others += [name for one in wanted.values() for name in draft.grants.depends_on(job.client, _as_param(job, one))]
+    others += [name for one in stated for name in draft.grants.depends_on(job.client, _as_param(job, one))]
     needed = set(others) - asked.keys()
     if draft.loans.is_compared:
         settings = Settings(tuple(asked.values()))
@@ -169,7 +183,7 @@ def _begin(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> None:
         needed.add(COMPARED)
     else:
         needed |= asked.keys()
-    lending = Lending(kind_before=before.kind_before, later=before.later)
+    lending = Lending(stated=stated, kind_before=before.kind_before, later=before.later)
     reading = replace(turn.reading(frozenset(needed)), lending=lending)
     draft.pending = replace(draft.pending, turn=reading)
     for name in sorted(needed - {COMPARED}):
@@ -177,10 +191,10 @@ def _begin(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> None:
         draft.forwarder, _ = draft.forwarder.ask_own(request, draft.now_s, ReadForTurn(job.number, name))
 
 
-def _to_compare(draft: StateDraft, job: ForwardedRequest) -> dict[str, Setting]:
+def _to_compare(draft: StateDraft, stated: tuple[Parameter, ...]) -> dict[str, Setting]:
     # by name, each with the values that may be in force; of a value to lend, that one comes first, and is claimed
     found: dict[str, Setting] = {}
-    for one in _stated(job):
+    for one in stated:
         found[one.name] = Setting(Parameter(one.name, None, one.unit), (one,), is_claimed=True)
     second = names.SAMPLE_BIAS
     if names.TIP_BIAS_VOLTAGE in found and draft.env.settings.limits.bias.may_have_second:
@@ -260,17 +274,24 @@ def take_set(draft: StateDraft, purpose: SetForTurn, response: Response) -> None
 
 
 def _decided(draft: StateDraft, job: ForwardedRequest, turn: Turn, lending: Lending) -> Lending | None:
-    compared = lending.compared or _compared_here(draft, job, turn)
+    compared = lending.compared or _compared_here(draft, turn, lending.stated)
     draft.limits = draft.limits.was_read(turn.values, draft.now_ns)
     of_kind = turn.values.get(names.SPEC_KIND)
     kind = (of_kind and of_kind.value) or ""
-    draft.loans, notes = draft.loans.compared(compared, kind)
-    for note in notes:
-        draft.log("WARNING", note)
+    draft.loans, changed = draft.loans.compared(compared, kind)
+    for key, loan in changed.items():
+        _found_changed(draft, key, loan, compared[loan.name].parameter)
+    stated = _with_pair(draft, _stated(draft, job, kind), compared)
+    if changed and stated[: len(lending.stated)] != lending.stated:  # a person's value takes the place of a stated one
+        _begin(draft, job, turn)
+        return None
+    if second_electrode := answers.refusal_for_second_electrode(job.request, _values_of(compared)):
+        _refuse(draft, job, second_electrode)
+        return None
     now = {name: one.parameter for name, one in compared.items()}
-    lending = replace(lending, compared=compared, now=now, kind=kind, way=())
+    lending = replace(lending, compared=compared, now=now, stated=stated, kind=kind, way=())
     way = list[WayStep]()
-    for one in _with_pair(draft, job, compared):
+    for one in stated:
         found = compared.get(one.name)
         if found is None:
             why = f"the microscope has no parameter {one.name}"
@@ -285,8 +306,8 @@ def _decided(draft: StateDraft, job: ForwardedRequest, turn: Turn, lending: Lend
             way.append(WayStep(key if lender else "", one, lender))
         elif lender:
             draft.loans = draft.loans.sending(key, found.parameter, found.parameter, lender, kind_of(one.name, kind))
-    stated = {key_of(one.name, kind) for one in _with_pair(draft, job, compared)}
-    back = [key for key in _due(draft, job, kind, compared) if key not in stated]
+    keys = {key_of(one.name, kind) for one in stated}
+    back = [key for key in _due(draft, job, kind, compared) if key not in keys]
     there = [key for key in back if draft.loans.loans[key].base in compared[draft.loans.loans[key].name].known]
     draft.loans = draft.loans.gone(there)
     way += [WayStep(key, draft.loans.loans[key].base) for key in back if key not in there]
@@ -314,9 +335,29 @@ def _due(draft: StateDraft, job: ForwardedRequest, kind: str, compared: Mapping[
     return [key for key in found if book.loans[key].name in compared]
 
 
-def _with_pair(draft: StateDraft, job: ForwardedRequest, compared: Mapping[str, Setting]) -> tuple[Parameter, ...]:
+def _found_changed(draft: StateDraft, key: str, loan: Loan, now: Parameter) -> None:
+    value, before = amount_text(now), amount_text(loan.base)
+    draft.log(
+        "WARNING",
+        f"{loan.name} reads {value}, and not the {amount_text(loan.value)} that {loan.lender} has lent it: "
+        f"{value} is its base from now on, where {before} was",
+    )
+    # half a way, or one without a watch, is no person's answer to the loan; and no plan measures beyond the limits
+    if loan.is_watched and loan.before is None and now.value is not None and not draft.limits.beyond_range(now):
+        draft.plans, notes = draft.plans.decided(key, now, loan.lender, "at the microscope")
+        _say(draft, notes)
+
+
+def _say(draft: StateDraft, notes: list[str]) -> None:
+    for note in notes:
+        draft.log("WARNING", note)
+
+
+def _with_pair(
+    draft: StateDraft, stated: tuple[Parameter, ...], compared: Mapping[str, Setting]
+) -> tuple[Parameter, ...]:
     # what lies between tip and sample is a difference: the second electrode is lent with the bias
-    stated, second = _stated(job), names.SAMPLE_BIAS
+    second = names.SAMPLE_BIAS
     given = {one.name for one in stated}
     if names.TIP_BIAS_VOLTAGE not in given or second in given or second not in compared:
         return stated
@@ -338,10 +379,10 @@ def _is_loan(draft: StateDraft, found: Setting, key: str) -> bool:
     return True
 
 
-def _compared_here(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> dict[str, Setting]:
+def _compared_here(draft: StateDraft, turn: Turn, stated: tuple[Parameter, ...]) -> dict[str, Setting]:
     # the translator answers no COMPARE: it is of another make
     found = dict[str, Setting]()
-    for name, asked in _to_compare(draft, job).items():
+    for name, asked in _to_compare(draft, stated).items():
         if name in turn.values:
             there = turn.values[name] or Parameter(name)
             found[name] = Setting(there, tuple(one for one in asked.known if equal(one, there)))
@@ -456,12 +497,11 @@ def _settle_s(draft: StateDraft, job: ForwardedRequest) -> float:
 def _finish(draft: StateDraft, job: ForwardedRequest, lending: Lending) -> None:
     payload = b""
     if job.request.kind == LEND_REQUEST:
-        stated = _with_pair(draft, job, lending.compared)
-        in_force = {one.name: lending.now.get(one.name, one) for one in stated}
-        token = draft.peers.sessions.token(job.client)
+        stated, token = lending.stated, draft.peers.sessions.token(job.client)
         draft.loans = draft.loans.stating(job.client, token, {key_of(one.name, lending.kind): one for one in stated})
-        given = (_answered(lending, in_force[one.name]) for one in _stated(job))
-        payload = draft.env.codec.encode(Settings(tuple(given)))
+        draft.plans = draft.plans.stating(job.client, *_planned(draft, job, lending))
+        given = tuple(_answered(draft, job, lending, one) for one in _asked(job))
+        payload = draft.env.codec.encode(Settings(given))
         if job.client == draft.control.holder:
             draft.lease = draft.lease.commanded(draft.now_ns, draft.now_s)
     elif job.request.kind == RETURN_REQUEST:
@@ -474,12 +514,30 @@ def _finish(draft: StateDraft, job: ForwardedRequest, lending: Lending) -> None:
         answers.finish(draft, job, Response(int(ControlResponse.SUCCESS), payload, "", job.request.id))
 
 
-def _answered(lending: Lending, in_force: Parameter) -> Setting:
-    # of a value that is not lent, the client learns the one before
-    found = lending.compared.get(in_force.name)
+def _planned(
+    draft: StateDraft, job: ForwardedRequest, lending: Lending
+) -> tuple[dict[str, Parameter], tuple[str, ...]]:
+    # the values whose place others may take, and the keys of swept ones; a person in MANUAL and a solver plan nothing
+    if draft.control.mode is ControlMode.MANUAL or draft.control.solving:
+        return {}, ()
+    asked = [one for one in _asked(job) if one.parameter.name in lending.compared]
+    lent = [one for one in asked if may_be_lent(lending.compared[one.parameter.name])]
+    planned = {key_of(one.parameter.name, lending.kind): one.parameter for one in lent if not one.is_swept}
+    return planned, tuple(key_of(one.parameter.name, lending.kind) for one in lent if one.is_swept)
+
+
+def _answered(draft: StateDraft, job: ForwardedRequest, lending: Lending, asked: Setting) -> Setting:
+    name = asked.parameter.name
+    found, in_force = lending.compared.get(name), lending.now.get(name, asked.parameter)
+    shown = draft.env.settings.limits.bias.of_sample if job.request.alias else _same
     if found is None or may_be_lent(found):
-        return Setting(in_force)
-    return Setting(in_force, (found.parameter,), is_lent=False)
+        return Setting(shown(in_force))
+    # of a value that is not lent, the client learns the one before
+    return Setting(shown(in_force), (shown(found.parameter),), is_lent=False)
+
+
+def _same(parameter: Parameter) -> Parameter:
+    return parameter
 
 
 def _try_again_later(draft: StateDraft) -> None:
@@ -489,6 +547,7 @@ def _try_again_later(draft: StateDraft) -> None:
 
 
 def _refuse(draft: StateDraft, job: ForwardedRequest, refusal: Response) -> None:
+    refusal = answers.with_alias(draft, job.request, refusal)
     answers.log_refusal(draft, job.client, refusal)
     _answer_unsent(draft, job, refusal)
 
@@ -496,18 +555,101 @@ def _refuse(draft: StateDraft, job: ForwardedRequest, refusal: Response) -> None
 def _answer_unsent(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
     if job.request.kind == RETURN_REQUEST:
         _try_again_later(draft)
-    draft.forwarder = draft.forwarder.without(job.number)
-    draft.pending = replace(draft.pending, turn=None)
-    answers.answer_unsent(draft, job, response)
+    answers.take_off(draft, job, response)
 
 
-def _stated(job: ForwardedRequest) -> tuple[Parameter, ...]:
+def _asked(job: ForwardedRequest) -> tuple[Setting, ...]:
     subject = job.request.subject
-    return subject.parameters if job.request.kind == LEND_REQUEST and isinstance(subject, Settings) else ()
+    return subject.settings if job.request.kind == LEND_REQUEST and isinstance(subject, Settings) else ()
+
+
+def _stated(draft: StateDraft, job: ForwardedRequest, kind: str) -> tuple[Parameter, ...]:
+    # each with what takes its place, which no point of a sweep has
+    return tuple(
+        one.parameter
+        if one.is_swept
+        else draft.plans.instead(job.client, key_of(one.parameter.name, kind), one.parameter)
+        for one in _asked(job)
+    )
+
+
+def _values_of(compared: Mapping[str, Setting]) -> dict[str, Parameter | None]:
+    return {name: one.parameter for name, one in compared.items()}
 
 
 def _as_param(job: ForwardedRequest, parameter: Parameter) -> Request:
     return Request(int(ControlRequest.PARAM), parameter, id=job.request.id)
+
+
+# --- decisions, and what takes the place of stated values -------------------------------------------------------------
+
+
+def begun(draft: StateDraft, client: str) -> None:
+    """Note that a measurement or treatment has begun, with what its client had stated for it."""
+    if not draft.control.solving:
+        bases = {key: loan.base for key, loan in draft.loans.loans.items() if key in draft.loans.stated}
+        draft.plans = draft.plans.begun(client, bases)
+    draft.loans = draft.loans.nothing_stated()
+
+
+def decided(draft: StateDraft, job: ForwardedRequest, answered: Parameter | None) -> None:
+    """Note what a client has set outside of a measurement: a base, and of a person or solver more than that."""
+    kind = draft.limits.kind_of_curve
+    if job.is_by_hand or not (draft.control.solving or _is_person(draft, job.client)):
+        draft.loans = draft.loans.decided(draft.limits.names_set_by(job.outgoing), kind)
+        return
+    for name, value in _values_set(job.outgoing, answered).items():
+        key = key_of(name, kind)
+        if job.client == draft.control.holder and draft.control.solving:
+            draft.plans = draft.plans.finding(key, value)
+        elif (loan := draft.loans.loans.get(key)) is not None and _is_person(draft, job.client):
+            draft.plans, notes = draft.plans.decided(key, value, loan.lender, f"by {job.client}")
+            _say(draft, notes)
+    draft.loans = draft.loans.decided(draft.limits.names_set_by(job.outgoing), kind)
+
+
+def _is_person(draft: StateDraft, client: str) -> bool:
+    # beside who is in control, the experiment file lets persons alone adjust anything
+    return client != draft.control.holder and not draft.env.settings.rules.is_agent(client)
+
+
+def _values_set(request: Request, answered: Parameter | None) -> dict[str, Parameter]:
+    subject = request.subject
+    if isinstance(subject, Parameter):
+        is_answer = answered is not None and answered.name == subject.name and answered.value is not None
+        return {subject.name: answered if answered is not None and is_answer else subject}
+    if not isinstance(subject, Feedback):
+        return {}
+    given = {
+        names.ZCTRL_PGAIN: subject.proportional_gain,
+        names.ZCTRL_IGAIN: subject.integral_gain,
+        names.ZCTRL_SETPOINT: subject.setpoint,
+    }
+    return {name: Parameter(name, repr(value)) for name, value in given.items() if value is not None}
+
+
+def _left(draft: StateDraft) -> tuple[Overruling, ...]:
+    if draft.control.mode is not ControlMode.MANUAL:
+        return ()
+    return draft.plans.left(draft.by_hand.parameters, draft.limits.kind_of_curve)
+
+
+def refusal_to_overrule(draft: StateDraft, event: RequestIn) -> str:
+    """Carry out a person's KEEP or AS_PLANNED; return why it is refused, empty if it is not."""
+    who, kept = event.name, event.request.kind == KEEP_REQUEST
+    if draft.env.settings.rules.is_agent(who):
+        return "a person decides what takes the place of a plan's values, and never an agent"
+    given = [one.name for one in event.request.subject.parameters]
+    if not kept:
+        draft.plans = draft.plans.as_planned(given)
+        draft.log("INFO", f"{who}: the plans measure with the values of their file again")
+        return ""
+    if draft.control.mode is not ControlMode.MANUAL:
+        return "values are kept before the run continues: the mode is AUTOMATED"
+    left = [one for one in _left(draft) if not given or one.planned.name in given]
+    draft.plans, notes = draft.plans.keeping(left, draft.limits.kind_of_curve, who)
+    _say(draft, notes)
+    return ""
 
 
 # --- returns that no measurement waits for ----------------------------------------------------------------------------
@@ -574,13 +716,17 @@ def due_s(state: SchedulerState | StateDraft) -> float | None:
 def publish_changes(draft: StateDraft) -> None:
     """Publish the loans if they have changed, and no more changes are on their way."""
     turn, book = draft.pending.turn, draft.loans
-    if book.loans is draft.before.loans.loans and book.shown is not None and turn is draft.before.pending.turn:
+    before = draft.before
+    now = book.loans, turn, draft.plans, draft.by_hand, draft.control.mode
+    then = before.loans.loans, before.pending.turn, before.plans, before.by_hand, before.control.mode
+    if book.shown is not None and all(one is other for one, other in zip(now, then, strict=True)):
         return
     is_on_its_way = turn is not None and turn.lending is not None and not turn.lending.is_done
-    if is_on_its_way or book.in_force == book.shown or draft.barrier.until_s is not None:
+    shown = LoansInForce(book.in_force, (*draft.plans.in_force, *_left(draft)))
+    if is_on_its_way or shown == book.shown or draft.barrier.until_s is not None:
         return
-    draft.loans = replace(book, shown=book.in_force)
-    publish(draft, LOANS.name, draft.env.codec.encode(book.in_force))
+    draft.loans = replace(book, shown=shown)
+    publish(draft, LOANS.name, draft.env.codec.encode(shown))
 
 
 def say_in_manual(draft: StateDraft) -> None:

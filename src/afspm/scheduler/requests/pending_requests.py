@@ -77,6 +77,7 @@ class Lending:
     Attributes:
         compared: the translator's answers by name.
         now: the values in force by name.
+        stated: what the measurement states, or what takes the place of it.
         way: the values to be set, in order; None: the values in force are being read.
         kind: the present kind of curve; empty: the microscope shows none.
         kind_before: the kind to be set back at the end; empty: none.
@@ -90,6 +91,7 @@ class Lending:
 
     compared: Mapping[str, Setting] = field(default_factory=dict)
     now: Mapping[str, Parameter] = field(default_factory=dict)
+    stated: tuple[Parameter, ...] = ()
     way: tuple[WayStep, ...] | None = None
     kind: str = ""
     kind_before: str = ""

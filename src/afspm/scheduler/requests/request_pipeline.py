@@ -46,7 +46,14 @@ from afspm.model import (
 )
 from afspm.model.idempotency_cache import TOO_OLD, RequestStatus
 from afspm.model.microscope_status import feedback_of
-from afspm.model.requests import COMPARE_REQUEST, OTHER_RUN_RESPONSE, RETURN_REQUEST, Settings
+from afspm.model.requests import (
+    AS_PLANNED_REQUEST,
+    COMPARE_REQUEST,
+    KEEP_REQUEST,
+    OTHER_RUN_RESPONSE,
+    RETURN_REQUEST,
+    Settings,
+)
 from afspm.model.sessions import Hearing, run_of
 from afspm.scheduler.control import control_change
 from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlChange, ControlInput, Rules, reason, row_for
@@ -228,6 +235,9 @@ def authorise(draft: StateDraft, event: RequestIn) -> bool:
         approvals.decide(draft, event)
     elif kind == RETURN_REQUEST:
         return lending.take_return(draft, event)
+    elif kind in (KEEP_REQUEST, AS_PLANNED_REQUEST):
+        why = lending.refusal_to_overrule(draft, event)
+        answers.answer(draft, event, ControlResponse.FAILURE if why else ControlResponse.SUCCESS, why)
     elif kind <= 0 or kind == COMPARE_REQUEST:
         why = f"there is no request with the number {kind}"
         answers.answer(draft, event, ControlResponse.CMD_NOT_SUPPORTED, why)
@@ -372,7 +382,7 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
         return
     # authorised again: control may have changed while the command waited; who has lent may return without control
     if job.request.kind != RETURN_REQUEST and (refusal := _not_allowed_now(draft, job)) is not None:
-        _answer_unsent(draft, job, refusal)
+        answers.take_off(draft, job, refusal)
         return
     if _knows_no_danger(draft, job):
         draft.pending = replace(draft.pending, turn=None)
@@ -390,7 +400,7 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
     if turn.awaited is None and _starts_reads(draft, job, turn):
         return
     _apply_read_values(draft, turn)
-    if (refusal := _refusal_for_second_electrode(job, turn)) is not None:
+    if (refusal := answers.refusal_for_second_electrode(job.request, turn.values)) is not None:
         _refuse(draft, job, refusal)
         return
     mapped = _mapped(draft, job)
@@ -407,7 +417,7 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
             return
         if why := draft.instruments.refusal(str(job.request.subject), draft.now_s, draft.now_ns):
             # not free: its client waits, and tries again
-            _answer_unsent(draft, job, Response(int(ControlResponse.NOT_FREE), b"", why, job.request.id))
+            answers.take_off(draft, job, Response(int(ControlResponse.NOT_FREE), b"", why, job.request.id))
             return
     _send(draft, job, mapped)
 
@@ -440,18 +450,9 @@ def _send(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None
 
 
 def _refuse(draft: StateDraft, job: ForwardedRequest, refusal: Response) -> None:
-    if alias := job.request.alias:
-        sign = "-" if draft.env.settings.limits.bias.sign < 0 else ""
-        refusal = replace(refusal, reason=f"{refusal.reason}; here {alias} is {sign}{job.request.subject.name}")
+    refusal = answers.with_alias(draft, job.request, refusal)
     answers.log_refusal(draft, job.client, refusal)
-    _answer_unsent(draft, job, refusal)
-
-
-def _answer_unsent(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
-    draft.forwarder = draft.forwarder.without(job.number)
-    if job.command:
-        draft.pending = replace(draft.pending, turn=None)
-    answers.answer_unsent(draft, job, response)
+    answers.take_off(draft, job, refusal)
 
 
 def _restart_lease(draft: StateDraft, client: str) -> None:
@@ -540,28 +541,12 @@ def _needs_second_electrode(draft: StateDraft, request: Request) -> bool:
     return bool(request.alias) and draft.env.settings.limits.bias.may_have_second
 
 
-def _refusal_for_second_electrode(job: ForwardedRequest, turn: Turn) -> Response | None:
-    if not job.request.alias or names.SAMPLE_BIAS not in turn.values:  # a microscope without it does not answer
-        return None
-    volts = "no value" if (found := turn.values[names.SAMPLE_BIAS]) is None else f"{found.value} {found.unit or 'V'}"
-    try:
-        if found is not None and float(found.value or "nan") == 0.0:
-            return None
-    except ValueError:
-        pass
-    why = (
-        f"{job.request.alias} is the whole voltage only while the second electrode is at 0 V, and "
-        f"{names.SAMPLE_BIAS} reads {volts}: set it to 0 V, or set {names.TIP_BIAS_VOLTAGE}"
-    )
-    return Response(int(ControlResponse.PARAM_ERROR), b"", why, job.request.id)
-
-
 def _take_read_value(draft: StateDraft, number: int, name: str, response: Response) -> None:
     turn, job = draft.pending.turn, draft.forwarder.waiting(number)
     if turn is None or job is None or turn.number != number:
         return  # it was called back
     if response.code == ControlResponse.NO_RESPONSE:
-        _answer_unsent(draft, job, _failed_before(response))
+        answers.take_off(draft, job, _failed_before(response))
     elif response.code in _LACKING:
         draft.limits = draft.limits.forget(name)
         draft.pending = replace(draft.pending, turn=turn.lacks(name))
@@ -625,9 +610,9 @@ def _take_move_result(draft: StateDraft, number: int, response: Response) -> Non
     if response.ok:
         draft.pending = replace(draft.pending, turn=replace(turn, move=turn.move.moved(draft.now_s)))
     elif response.code == ControlResponse.NO_RESPONSE:
-        _answer_unsent(draft, job, _failed_before(response))
+        answers.take_off(draft, job, _failed_before(response))
     else:
-        _answer_unsent(draft, job, response)
+        answers.take_off(draft, job, response)
 
 
 # --- 5. settled: the translator has answered, or did not in time ----------------------------------------------------
@@ -756,7 +741,7 @@ def _apply_success(draft: StateDraft, job: ForwardedRequest, response: Response)
         _restart_lease(draft, job.client)
         approvals.done(draft, job)
         if job.client:
-            draft.loans = draft.loans.decided(draft.limits.names_set_by(job.outgoing), draft.limits.kind_of_curve)
+            lending.decided(draft, job, answered)
         if job.is_by_hand and draft.control.mode is ControlMode.MANUAL:
             draft.by_hand = draft.by_hand.requested(request)
     return response
@@ -765,7 +750,7 @@ def _apply_success(draft: StateDraft, job: ForwardedRequest, response: Response)
 def _action_started(draft: StateDraft, job: ForwardedRequest, *, is_certain: bool) -> None:
     action = str(job.request.subject)
     if action in lending.MEASURES:
-        draft.loans = draft.loans.nothing_stated()
+        lending.begun(draft, job.client)
     draft.watchdog = draft.watchdog.started(action, job.states_seen, draft.microscope)
     if (state := STARTED.get(action)) is not None:
         until_s = draft.now_s + draft.env.settings.control.request_timeout_s
