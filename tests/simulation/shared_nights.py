@@ -4,8 +4,9 @@
 
 Plans state different settings, or none; sweeps, curves, a solver, decisions and a person change values in between. The
 scheduler, the translator and the components are real, and die at random. In the truth of the simulation, each published
-measurement must have been taken with the settings that its plan states, and with the base for all others. The base is
-the value at the start, or the last decision: of a person at the panel, or of a component by a plain `scope.set`.
+measurement must have been taken with the settings that its plan states, or with what the log has said takes their
+place, and with the base for all others. The base is the value at the start, or the last decision: of a person at the
+panel, or of a component by a plain `scope.set`.
 """
 
 from __future__ import annotations
@@ -36,11 +37,12 @@ from afspm.model import ControlMode, ControlRequest, JournalEntry, MeasurementCo
 from afspm.model import names as n
 from afspm.model.events import ControlEvent
 from afspm.scheduler.loans import Loan, LoanBook
+from afspm.scheduler.overrulings import PlanBook
 from afspm.scheduler.requests import lending
 from afspm.testing import Bench
 
 MUTANTS: Final[Mapping[str, tuple[Any, str, Any]]] = {
-    "compares nothing": (LoanBook, "compared", lambda book, settings, kind: (book, [])),
+    "compares nothing": (LoanBook, "compared", lambda book, settings, kind: (book, {})),
     "sets nothing back": (LoanBook, "due", lambda book, action, kind: []),
     "states for ever": (LoanBook, "nothing_stated", lambda book: book),
     "base is the last loan": (
@@ -48,6 +50,7 @@ MUTANTS: Final[Mapping[str, tuple[Any, str, Any]]] = {
         "sending",
         lambda book, key, now, value, lender, kind: book._with(key, Loan(now, value, lender or "x", kind)),
     ),
+    "a person's value is a base alone": (PlanBook, "instead", lambda book, lender, key, planned: planned),
     "answers before all is set": (lending, "_in_order", lambda draft, found, way: tuple(way[:1])),
 }
 """Parts of the book of loans that are left out, each of which a night must see."""
@@ -61,6 +64,7 @@ OF_CURVES: Final = (n.SPEC_FROM, n.SPEC_TO, n.SPEC_POINTS)
 _START_S = 1.75e9  # experiment time at the start of a bench
 _SHAPE, _SIZE_M = (8, 8), (200e-9, 200e-9)
 _UNSEEN_S = 0.3
+_PLACE_TAKEN = re.compile(r"(\S+) measures at (\S+) ([^,]+?)(?:, set (.+); it states (.+)| (again), as it states)$")
 _REFUSALS = (Refused, ControlLost, NoResponse)
 _BASE = {
     **dict(zip(OF_SCANS, (0.1, math.nan, 0.1, 1500.0, 10e-6), strict=True)),
@@ -439,6 +443,14 @@ class Evidence:
         found = (one.key for sent_ns, one in starts if sent_ns / 1e9 - 1e-3 <= at_s <= one.time_ns / 1e9 + 1e-3)
         return next(found, "")
 
+    def instead(self, plan: str, name: str, at_s: float) -> tuple[float, float] | None:
+        """Return the value that takes the place of a plan's, and the stated one, as the log said; None: the plan's."""
+        found = ((at, _PLACE_TAKEN.match(text)) for at, text in self.said if at <= at_s)
+        of_plan = [one for _, one in found if one is not None and one.group(1, 2) == (plan, name)]
+        if not of_plan or of_plan[-1][6]:
+            return None
+        return _numbers(of_plan[-1][3])[0], _numbers(of_plan[-1][5])[0]
+
     def says_left(self, name: str, value: float) -> bool:
         """Return whether the log says at the end that a parameter has this value."""
         is_manual = bool(self.modes) and not self.modes[-1][1]  # then it was said as MANUAL began
@@ -583,7 +595,7 @@ class Night:
         number = re.fullmatch(f"{KEY}-(\\d+)", key) if plan.swept else None
         points = (plan.points[int(number[1]) - 1],) if number else plan.points
         for name, value in {**taken.values, **({} if curve is None else _of_curve(curve))}.items():
-            right = accepted(states, name, self, taken.at_s)
+            right = accepted(plan, states, name, self, taken.at_s)
             if name == plan.swept:  # an act that no poll can have seen before the begin is not repaired
                 just_before = (one for one in self.decisions if 0.0 <= taken.at_s - one.at_s < _UNSEEN_S)
                 right = (*points, *(one.value for one in just_before if one.name == name and one.by == "person"))
@@ -642,19 +654,21 @@ class Night:
         self.met[f"{what}, off the base" if is_lent else what] += 1
 
 
-def accepted(states: Values, parameter: str, night: Night, at_s: float) -> tuple[float, ...]:
+def accepted(plan: Plan, states: Values, parameter: str, night: Night, at_s: float) -> tuple[float, ...]:
     """Return the values that a plan with these settings may measure with at a time.
 
-    A decision of a person about a value that the plan has in force, or of a solver, may take the plan's place.
+    What takes the place of a plan's value must have been said before; an act right before the begin is seen after it.
     """
     if parameter not in states:
         return (night.base(parameter, at_s),)
-    right = [states[parameter]]
-    for one in night.decisions:
-        is_of_plan = one.by == "solver" or any(same(one.before, value) for value in right)
-        if one.name == parameter and one.at_s <= at_s and one.is_for_plans and is_of_plan:
-            right.append(one.value)
-    return tuple(right)
+    acts = [one for one in night.decisions if one.name == parameter and one.by == "person" and one.at_s <= at_s]
+    unseen = [one.value for one in acts if at_s - one.at_s < _UNSEEN_S]
+    place = night.evidence.instead(plan.name, parameter, at_s)
+    if place is None or not same(place[1], states[parameter], 0.01):
+        return (states[parameter], *unseen)
+    night.met["measured with a decision in the place of the plan's value"] += 1
+    # the log rounds
+    return (*(one.value for one in night.decisions if same(one.value, place[0], 1e-3)), *unseen)
 
 
 def same(one: float, other: float, within: float = 1e-5) -> bool:
