@@ -56,7 +56,7 @@ from afspm.model import (
 from afspm.model.curve_request import CurveSettings, curve_parameters
 from afspm.model.events import HasTime
 from afspm.model.instruments import InstrumentOrders, is_of_instrument, newest_of
-from afspm.model.requests import AS_PLANNED_REQUEST, KEEP_REQUEST, Settings
+from afspm.model.requests import AS_PLANNED_REQUEST, KEEP_REQUEST, RETURN_REQUEST, Settings
 from afspm.model.sessions import KEYED
 from afspm.model.sweep_plan import SweepAxis, SweepOrder, SweepPlan, SweptValues
 from afspm.transport.process.parent import StopRequested
@@ -215,6 +215,19 @@ class Scope(ExperimentView):
                 yield
         finally:
             self._lent, self._settle_s = outside
+
+    @checked_call
+    def set_back(self, *, timeout_s: float | None = ANSWER_S) -> None:
+        """Wait until the scheduler has set back all settings that measurements do not need any more.
+
+        A component that solves a problem finds those of others set back before its own measurements and treatments. It
+        calls this before it leaves the microscope to a person. What can't be set back is in the log.
+
+        Raises:
+            NoResponse: they are not set back within the timeout.
+        """
+        with self._call():
+            self._link.request(RETURN_REQUEST, Settings(), until_s=self._link.until(timeout_s))
 
     def _carrying(self, target: TargetT, settings: Mapping[str, Value] | None = None) -> TargetT:
         own = (*target.settings, *_parameters(settings or {}).values())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Callable
+from contextlib import suppress
 from typing import ClassVar, Literal
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
@@ -30,6 +31,7 @@ _ASKS_FOR_S = 2.0  # real time; then other packets are handled before it asks ag
 _PUBLISHED_WITHIN_S = 10.0  # for the state that follows from what it asked
 _ACCEPTED_WITHIN_S = 30.0  # for an action of the microscope to begin
 _MOVED_WITHIN_S = 600.0  # real time: an approach may take minutes
+_SET_BACK_WITHIN_S = 60.0
 _SETTLED_TICKS = 3
 SCHEDULER = "scheduler"
 _ALARM = "the quiet hours are over, and the run waits for a person"
@@ -48,7 +50,8 @@ class QuietHours(Component):
     """A component that pauses the experiment between two times of the day, such as from 22:00 to 7:00.
 
     At the begin a running scan or curve is finished, and so is the repair of a problem. Then the component flags
-    `quiet-hours`, which takes control from all others, withdraws the tip if it should, and sets MANUAL. A measurement
+    `quiet-hours`, which takes control from all others, waits until the settings of measurements are set back, withdraws
+    the tip if it should, and sets MANUAL. A measurement
     that another component starts in just this moment is stopped, and repeated after the pause.
 
     At the end the component sets AUTOMATED, brings the tip back, and clears the flag: the others go on. It does so only
@@ -161,6 +164,8 @@ class QuietHours(Component):
             self.scope.supports(names.STOP_SCAN)
             if not self.scope.wait_until(lambda: self._is_free, timeout_s=_PUBLISHED_WITHIN_S):
                 raise ControlLost("the microscope is not free yet", where=self.name)
+            with suppress(NoResponse):  # what stays in force is in the log, as MANUAL begins
+                self.scope.set_back(timeout_s=_SET_BACK_WITHIN_S)
             self._note(since_ns=self.clock.now_ns(), touched="", tip_touched=False)
             why = self._withdraw()
             if not self.scope.in_control:

@@ -227,6 +227,11 @@ class LoanBook:
         }
         return self if loans == self.loans else replace(self, loans=loans)
 
+    def unwatched(self, name: str) -> LoanBook:
+        """Return the book when a value may have changed without a decision about it."""
+        unwatched = {key: replace(loan, is_watched=False) for key, loan in self.loans.items() if loan.name == name}
+        return replace(self, loans={**self.loans, **unwatched}) if unwatched else self
+
     def used(self, now_ns: int) -> LoanBook:
         """Return the book after a request for settings: the microscope is idle since then."""
         return self if self.free_since_ns is None else replace(self, free_since_ns=now_ns)

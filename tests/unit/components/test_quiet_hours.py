@@ -24,6 +24,7 @@ from afspm.model import (
     JournalEntry,
     PanelAct,
 )
+from afspm.model.requests import RETURN_REQUEST
 from afspm.scheduler.publishing.event_log import panel_entry
 from afspm.testing import Bench
 from afspm.testing.components.simulated_time import START_S
@@ -150,6 +151,19 @@ def test_run_pauses_between_two_scans_and_goes_on(night: Night) -> None:
     assert night.is_at_work
     states = [one.state.name for one in night.bench.published("ScopeStateMsg")]
     assert "INTERRUPTED" not in states
+
+
+def test_no_tip_waits_the_night_through_at_the_bias_of_a_plan(tmp_path: Path) -> None:
+    plan = ScanSeries((1e-6, 1e-6), pixels=(16, 16), every=60.0, scans=10_000, parameters={"tip-bias-voltage": "-2 V"})
+    night = Night(tmp_path, others={"series": plan})
+    night.go_to(1.3)
+    assert night.is_paused
+    before, now = night.bench.published("Loans")[-2:]
+    assert [one.lender for one in before.loans] == ["series"]
+    assert now.loans == ()
+    kinds = [one.request for one in night.entries if one.who == "quiet_hours"]
+    assert kinds.index(RETURN_REQUEST) < kinds.index(ControlRequest.SET_CONTROL_MODE)
+    night.bench.close()
 
 
 def test_person_who_lets_the_run_continue_is_right_until_the_next_begin(night: Night) -> None:

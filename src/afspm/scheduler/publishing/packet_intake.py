@@ -19,6 +19,7 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
     TipStatus,
+    names,
 )
 from afspm.scheduler.control import control_change
 from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlInput
@@ -109,6 +110,9 @@ def _update_state(draft: StateDraft, published: object) -> None:
 def _take_act(draft: StateDraft, act: ActByHand) -> None:
     is_manual = draft.control.mode is ControlMode.MANUAL
     draft.others_may_have_acted(is_watched=not is_manual)
+    if any(one.parameter == names.SCAN_SIZE_X for one in act.changes):
+        # behind the speed of some makers is a line rate: another width is no decision about the speed
+        draft.loans = draft.loans.unwatched(names.SCAN_SPEED)
     draft.limits = draft.limits.seen(Parameter(one.parameter, one.after, one.unit or None) for one in act.changes)
     for one in act.changes:
         if is_manual:
