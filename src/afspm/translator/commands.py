@@ -31,7 +31,7 @@ from afspm.translator.claims import Claims
 from afspm.translator.driver_base import LOST, Action, DriverBase
 from afspm.translator.hurry import unhurried
 from afspm.translator.panel_watch import PanelWatch
-from afspm.translator.parameters import Value
+from afspm.translator.parameters import FEEDBACK_ON, Value
 from afspm.translator.sequence import SequenceStep, StatusSequence
 from afspm.translator.setters import PersonActs, apply, wanted_values
 from afspm.translator.setting_groups import MOVES, of_message
@@ -207,6 +207,34 @@ class Commands:
         return done
 
     def _apply(self, values: Mapping[str, Value], about_to_act: Callable[[], None] = lambda: None) -> dict[str, Value]:
+        if not self._passes_zero(values):
+            return self._applied(values, about_to_act)
+        about_to_act()
+        return self._temporary.held.through_zero(partial(self._applied, values))
+
+    def _passes_zero(self, values: Mapping[str, Value]) -> bool:
+        # whether z is held for it
+        driver, electrodes = self._driver, (names.TIP_BIAS_VOLTAGE, names.SAMPLE_BIAS)
+        how, setpoint = driver.common.bias_through_zero, driver.table.get(names.ZCTRL_SETPOINT)
+        if how == "jump" or values.keys().isdisjoint(electrodes) or setpoint is None or setpoint.si_unit != "A":
+            return False
+        shown = [one for one in (*electrodes, FEEDBACK_ON, names.ENGAGED) if one in driver.table]
+        before = driver.in_force(shown)
+        tip, second = ({**before, **values}.get(one, 0.0) for one in electrodes)
+        gap_v = float(before[names.TIP_BIAS_VOLTAGE]) - float(before.get(names.SAMPLE_BIAS, 0.0))
+        is_safe = before.get(FEEDBACK_ON) is False or before.get(names.ENGAGED) is False
+        if is_safe or gap_v * (float(tip) - float(second)) >= 0.0:
+            return False
+        is_free = self._sequence.published.state is ScopeState.FREE
+        if how == "hold" and is_free and driver.held_z is not None and FEEDBACK_ON in driver.table:
+            return True
+        why = "in a measurement" if not is_free else driver.cant_hold_z if how == "hold" else "as the file says"
+        remedy = 'withdraw the tip first, or write bias_through_zero = "jump" into [microscope]'
+        raise Refused(ControlResponse.PARAM_ERROR, f"the bias may not pass 0 V with the feedback on ({why}): {remedy}")
+
+    def _applied(
+        self, values: Mapping[str, Value], about_to_act: Callable[[], None] = lambda: None
+    ) -> dict[str, Value]:
         try:
             read_back = apply(self._driver, values, about_to_act, self._panel.seen_in_request)
         except PersonActs as contended:

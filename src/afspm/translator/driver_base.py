@@ -179,6 +179,9 @@ class Introduction(Protocol):
         """Return the controller's answer to a line; empty to disconnect."""
 
 
+ThroughZero = Literal["jump", "hold", "refuse"]
+
+
 @dataclass(frozen=True)
 class CommonSettings:
     """The settings that every driver takes: see `DriverBase`."""
@@ -189,6 +192,7 @@ class CommonSettings:
     live_lines_s: float | None
     trace: bool
     settle_before_scan_s: float
+    bias_through_zero: ThroughZero
 
 
 class DriverBase(ABC):
@@ -229,6 +233,9 @@ class DriverBase(ABC):
             the wiring: "sample" or "tip". With it there is the parameter `sample-bias`.
         settle_before_scan_s: wait after a request that moves the frame, in experiment seconds: the microscope counts as
             moving until the scanner has settled, so that no scan begins.
+        bias_through_zero: what follows where a request lets the bias change its sign at the sample, with a feedback on
+            a current: "jump": it is set; "hold": z is held without feedback for it, since the feedback drives the tip
+            towards the sample near 0 V; "refuse": it is refused.
         trace: record all exchanges with the controller in `controller.trace.jsonl` of the run's folder.
 
     Attributes:
@@ -341,6 +348,7 @@ class DriverBase(ABC):
         live_lines_s: Duration | None = None,
         trace: bool = False,
         settle_before_scan_s: Duration = 0.0,
+        bias_through_zero: ThroughZero = "jump",
         bias_reference: Literal["sample", "tip"] | None = None,
     ) -> None:
         if live_lines_s is not None and type(self).lines is DriverBase.lines:
@@ -351,7 +359,13 @@ class DriverBase(ABC):
         self.channels = self.channels_of({"channels": channels})
         self.bias = self.bias_of({"bias_reference": bias_reference}, self.table)
         self.common = CommonSettings(
-            dict(actions or {}), poll_period_s, result_timeout_s, live_lines_s, trace, settle_before_scan_s
+            dict(actions or {}),
+            poll_period_s,
+            result_timeout_s,
+            live_lines_s,
+            trace,
+            settle_before_scan_s,
+            bias_through_zero,
         )
         self.adjustable: frozenset[str] = frozenset()
         self.prove: Callable[[], None] = _prove_nothing

@@ -141,6 +141,42 @@ class HeldZ:
             Refused: the feedback is off or can't be switched off, the tip is withdrawn, or it moved meanwhile.
             an error in `LOST`.
         """
+        self._hold(is_asked=True)
+
+    def through_zero(self, set_bias: Callable[[], dict[str, Value]]) -> dict[str, Value]:
+        """Set a bias of the other sign while z is held, and return the values read back.
+
+        Near 0 V a feedback that holds a current drives the tip into the sample.
+
+        Raises:
+            Refused: z can't be held, the bias is refused, or the feedback is not on again: the tip is then withdrawn.
+            an error in `LOST`: the way back of a held z follows.
+        """
+        self._hold(is_asked=False)
+        try:
+            found = set_bias()
+        except LOST:
+            raise
+        except Exception:  # raised again: `apply` has set the bias back, and z has not moved
+            self._switch_on(self._kept[_KEY])
+            raise
+        self._kept[_KEY]["former"] |= {name: value for name, value in found.items() if name in _RESTORED}
+        self._switch_on(self._kept[_KEY])
+        return found
+
+    def _switch_on(self, found: Plain) -> None:
+        try:
+            apply(self._driver, {FEEDBACK_ON: True})
+        except LOST:
+            raise
+        except Exception as error:  # a driver may raise anything, and a tip without feedback must not be left so
+            self._fail(found, str(error))
+            raise Refused(ControlResponse.PARAM_ERROR, f"the bias was set, and the tip withdrawn: {error}") from error
+        self.switched_on()
+        self._forget("")
+
+    def _hold(self, *, is_asked: bool) -> None:
+        # is_asked: the run knows of the hold, and asks for its end
         driver = self._driver
         self._refuse_hold()
         self._kept.pop(_ENDED, None)
@@ -150,7 +186,7 @@ class HeldZ:
         now_s = driver.clock.now_s()
         self._kept[_KEY] = {
             "phase": _OFF, "z_m": before_m, "at_m": 0.0, "offset_m": 0.0, "former": former, "moved": False,
-            "was_set": False, "next_s": now_s, "stepped_s": now_s, "why": "",
+            "was_set": False, "next_s": now_s, "stepped_s": now_s, "why": "", "is_asked": is_asked,
         }  # fmt: skip
         self._state.save()  # before any change: a kill must not lose the way back
         try:
@@ -407,8 +443,8 @@ class HeldZ:
         return "" if self._found is None else str(self._found["phase"])
 
     def _forget(self, why: str) -> None:
-        self._kept.pop(_KEY, None)
-        if why:
+        found = self._kept.pop(_KEY, None) or {}
+        if why and found.get("is_asked", True):
             self._kept[_ENDED] = why
         self._state.save()
 

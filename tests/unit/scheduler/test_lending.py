@@ -464,6 +464,20 @@ def test_way_goes_in_the_steps_that_limits_allow() -> None:
     assert max(abs(b - a) for a, b in itertools.pairwise(ways)) <= 0.25 + 1e-9
 
 
+@pytest.mark.parametrize(
+    ("start", "end"), [(0.5, -1.0), (-1.0, 0.5), (0.1, -0.9), (0.5, -0.01), (0.01, -0.5), (1.0, -1.0), (0.2, -0.2)]
+)
+def test_no_step_of_a_bias_ends_near_zero(start: float, end: float) -> None:
+    desk = Desk(limited(tip_bias_voltage=Limit(step=0.25, unit="V")))
+    desk.panel[BIAS] = start
+    desk.measures("a", tip_bias_voltage=f"{end} V")
+    way = [start, *(float(value) for _, value in desk.sets)]
+    assert way[-1] == end
+    assert all(abs(b - a) <= 0.25 * (1 + 1e-9) for a, b in itertools.pairwise(way))
+    assert min(map(abs, way)) >= min(0.125, abs(start), abs(end))
+    assert sum(a * b < 0.0 for a, b in itertools.pairwise(way)) == 1
+
+
 def test_value_beyond_its_range_is_refused_before_the_first_step_to_it() -> None:
     desk = Desk(limited(tip_bias_voltage=Limit(high=3.0, step=0.25, unit="V")))
     assert "above the highest allowed, 3 V" in desk.measures("a", tip_bias_voltage="4 V").reason

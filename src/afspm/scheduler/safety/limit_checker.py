@@ -472,6 +472,9 @@ class LimitChecker:
         start, end = self.number(now), self.number(wanted)
         if limit is None or limit.step is None or start is None or end is None:
             return wanted
+        if wanted.name == names.TIP_BIAS_VOLTAGE and start * end < 0.0 and abs(end - start) > limit.step:
+            end = _beside_zero(start, end, limit.step)
+            wanted = Parameter(wanted.name, f"{end:.12g}", limit.unit or wanted.unit)
         count = math.ceil(abs(end - start) / limit.step * (1 - _REACH))
         if count <= 1:
             return wanted
@@ -751,3 +754,11 @@ def is_get(request: Request) -> bool:
 
 def _has_value_of(reported: Parameter, asked: Parameter) -> bool:
     return reported.value is not None and reported.name == asked.name
+
+
+def _beside_zero(start: float, end: float, step: float) -> float:
+    # no step of a bias ends near 0 V, where a feedback drives the tip into the sample: one passes it from side to side
+    near = min(step / 2.0, abs(start), abs(end))
+    if abs(start) > near * (1 + _REACH):
+        return math.copysign(near, start)
+    return math.copysign(min(step - near, abs(end)), end)

@@ -29,7 +29,7 @@ from afspm.simulation.truth import Truth
 from afspm.simulation.world import read_settings
 from afspm.storage.formats import read
 from afspm.translator.driver import Driver
-from afspm.translator.driver_base import Action, ControllerLost, action
+from afspm.translator.driver_base import Action, ControllerLost, ThroughZero, action
 from afspm.translator.parameters import FEEDBACK_ON, Value
 
 if TYPE_CHECKING:
@@ -139,6 +139,8 @@ class Simulator(Driver):
         result_timeout_s: longest delay of the file after the end of a scan or spectrum.
         live_lines_s: interval between publications of lines of a running scan; 0: never; by default 0.5 real seconds.
         settle_before_scan_s: wait after a move of the frame, before a scan can begin.
+        bias_through_zero: `"jump"`, `"hold"` or `"refuse"` where a bias changes its sign at the sample with a feedback
+            on a current, as for all microscopes.
         bias_reference: "sample" alone, which the simulated microscope has, so that a maker's file can be rehearsed.
     """
 
@@ -188,6 +190,7 @@ class Simulator(Driver):
         result_timeout_s: Duration = 10.0,
         live_lines_s: Duration | None = None,
         settle_before_scan_s: Duration = 0.0,
+        bias_through_zero: ThroughZero = "jump",
         bias_reference: Literal["sample", "tip"] | None = None,
     ) -> None:
         world: Table = {
@@ -230,6 +233,7 @@ class Simulator(Driver):
                 result_timeout_s=result_timeout_s,
                 live_lines_s=live_lines_s,
                 settle_before_scan_s=settle_before_scan_s,
+                bias_through_zero=bias_through_zero,
                 bias_reference=bias_reference,
             )
             self.channels = self.channels_of({**self._world_settings, "channels": channels})
