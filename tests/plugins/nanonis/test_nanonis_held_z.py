@@ -97,3 +97,18 @@ def test_tip_is_withdrawn_if_z_can_not_be_read_on_the_way_back(bench: Make) -> N
     assert rig.ledger.crashes == 0
     refused = peer.act(names.RELEASE_Z)
     assert "as before it: tip-bias-voltage 0.1 V" in refused.reason
+
+
+def test_bias_passes_zero_while_the_feedback_is_off_on_the_wire(bench: Make) -> None:
+    made = bench(**STM)
+    peer = made.start(bias_through_zero="hold")
+    ready(peer)
+    made.emulator.asked.clear()
+    assert peer.set(names.TIP_BIAS_VOLTAGE, -0.5, "V").ok
+    there = [name for name in next(iter(made.emulator.asked.values())) if name in SWITCHES]
+    wanted = ("ZCtrl.OnOffSet", "ZCtrl.OnOffGet", "Bias.Set", "Bias.Get", "ZCtrl.OnOffSet", "ZCtrl.OnOffGet")
+    assert in_order(there, *wanted)
+    assert (there.count("ZCtrl.OnOffSet"), there.count("Bias.Set")) == (2, 1)
+    rig = made.emulator.rig
+    assert (rig.setup.feedback.on, rig.setup.bias_v, rig.ledger.crashes) == (True, pytest.approx(-0.5), 0)
+    assert peer.act_once_free(names.START_SCAN).ok

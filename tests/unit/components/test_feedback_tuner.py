@@ -27,7 +27,9 @@ from afspm.model import (
     ScopeState,
     names,
 )
+from afspm.model.events import ControlEvent
 from afspm.model.requests import LEND_REQUEST, RETURN_REQUEST
+from afspm.testing import Bench
 
 SETPOINT = 0.5
 BEFORE = 1.0
@@ -240,3 +242,27 @@ def test_a_gain_that_cannot_be_set_back_stops_the_scans_until_a_person_has_looke
     assert set(lab.problems) == {Problem.FEEDBACK_NON_OPTIMAL, Problem.DEVICE_MALFUNCTION}
     assert "integral gain 1 can't be set again: the log of the scheduler says why" in caplog.text
     assert "as before" not in caplog.text
+
+
+@pytest.mark.slow
+def test_gain_of_a_plan_that_is_found_bad_is_searched_for_once(tmp_path: Path) -> None:
+    sample = (Path(__file__).parents[3] / "experiments" / "feedback_gains" / "experiment.toml").read_text("utf-8")
+    (file := tmp_path / "experiment.toml").write_text(sample, encoding="utf-8")
+    (plan := tmp_path / "plan.toml").write_text(
+        """
+        [microscope]
+        panel = []
+        initial = { zctrl-igain = 600.0, scan-speed = "4 um/s" }
+        [series]
+        parameters = { zctrl-igain = 5.0 }
+        """,
+        encoding="utf-8",
+    )
+    bench = Bench.of(str(file), str(plan), component="series", without=("night",))
+    bench.run(until="35 min")
+    entries = [one for batch in bench.published("JournalEntries") for one in batch.entries]
+    (loans,) = bench.published("Loans")[-1:]
+    bench.close()
+    assert sum(one.event is ControlEvent.PROBLEM_FLAGGED for one in entries) == 1
+    (rule,) = loans.overruled
+    assert (rule.lender, rule.planned.value, rule.by) == ("series", "5.0", "by tuner")
