@@ -81,6 +81,20 @@ def test_a_person_takes_over_and_hands_back(night: Night, page: Any, keep: Any) 
     page.wait_for_selector("[data-part=mode]:text-is('AUTOMATED')")
 
 
+def test_a_value_left_in_manual_is_kept_or_left_to_the_plan(night: Night, page: Any, keep: Any) -> None:
+    take_over(page, night)
+    set_speed(page, "3 um/s", "3 µm/s")
+    page.wait_for_selector("text=series sets scan-speed 4 µm/s again (you left 3 µm/s)")
+    keep(page, "left_in_manual")
+    press(page, "Keep mine")
+    page.wait_for_selector("text=series measures at scan-speed 3 µm/s, set by dashboard:Ada; it states 4 µm/s")
+    keep(page, "not_as_planned")
+    press(page, "As planned")
+    page.wait_for_selector("text=series sets scan-speed 4 µm/s again")
+    set_speed(page, "4 um/s", "4 µm/s")
+    page.locator("[data-part=setting]").wait_for(state="detached")
+
+
 def test_a_problem_is_raised_and_cleared(night: Night, page: Any) -> None:
     choose(page, "problem", "drop-on-the-table")
     press(page, "Flag")

@@ -44,6 +44,7 @@ center = ["0.3 um", "-0.2 um"]
 pixels = [40, 64]
 every = "{every}"
 scans = 20
+parameters = {{ scan-speed = "4 um/s" }}
 
 [control]
 solved_by_hand = ["tip-shape-changed", "device-malfunction", "drop-on-the-table"]

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
-from afspm.basics.formatting import quantity
+from afspm.basics.formatting import PREFIXABLE, quantity
+from afspm.basics.units import convert, si_unit_or_none
 
 HAS_ENDED = "the experiment has ended"
 """The reason of every refusal after the end."""
@@ -248,10 +249,13 @@ class LoansInForce:
 
 def amount_text(parameter: Parameter) -> str:
     """Return a value with its unit as text for people."""
+    unit = parameter.unit or ""
+    si = si_unit_or_none(unit) or ""
     try:
-        return quantity(float(parameter.value or ""), parameter.unit or "")
+        number = float(parameter.value or "")
     except ValueError:
         return parameter.value or "no value"
+    return quantity(float(convert(number, unit, si)), si) if si in PREFIXABLE else quantity(number, unit)
 
 
 @dataclass(slots=True)

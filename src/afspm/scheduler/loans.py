@@ -108,7 +108,8 @@ class LoanBook:
 
     @property
     def in_force(self) -> tuple[LoanInForce, ...]:
-        return tuple(loan.in_force for loan in self.loans.values())
+        """The loans for people: a value that is its own base looks like none."""
+        return tuple(one.in_force for one in self.loans.values() if one.why or not equal(one.value, one.base))
 
     def of_kind(self, kind: str) -> Iterator[tuple[str, Loan]]:
         """Yield the loans whose value can be read now, with their keys."""

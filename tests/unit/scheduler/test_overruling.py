@@ -320,3 +320,12 @@ def test_lend_under_the_name_of_the_samples_bias_is_answered_and_refused_under_i
     assert "here sample-bias is -tip-bias-voltage" in desk.lends("a", sample_bias="3 V").reason
     desk.panel[names.SAMPLE_BIAS] = 0.2
     assert "is the whole voltage only while the second electrode is at 0 V" in desk.lends("a", sample_bias="1 V").reason
+
+
+def test_value_that_may_be_rounded_by_a_translator_of_another_make_is_a_base_alone() -> None:
+    desk = Desk()
+    desk.compares = False
+    desk.measures("a", **A)
+    desk.panel[BIAS] = 0.5001
+    desk.measures("a", **A)
+    assert (desk.measured[-1][BIAS], overruled(desk)) == (0.5, [])

@@ -342,8 +342,10 @@ def _found_changed(draft: StateDraft, key: str, loan: Loan, now: Parameter) -> N
         f"{loan.name} reads {value}, and not the {amount_text(loan.value)} that {loan.lender} has lent it: "
         f"{value} is its base from now on, where {before} was",
     )
-    # half a way, or one without a watch, is no person's answer to the loan; and no plan measures beyond the limits
-    if loan.is_watched and loan.before is None and now.value is not None and not draft.limits.beyond_range(now):
+    # half a way, or one without a watch, is no person's answer to the loan; nor is what may be the rounding of a
+    # controller. No plan measures beyond the limits
+    is_act = loan.is_watched and loan.before is None and draft.loans.is_compared
+    if is_act and now.value is not None and not draft.limits.beyond_range(now):
         draft.plans, notes = draft.plans.decided(key, now, loan.lender, "at the microscope")
         _say(draft, notes)
 
@@ -731,8 +733,8 @@ def publish_changes(draft: StateDraft) -> None:
 
 def say_in_manual(draft: StateDraft) -> None:
     """Log what stays in force while a person has the microscope."""
-    for loan in draft.loans.loans.values():
+    for loan in draft.loans.in_force:
         value, base = (draft.limits.number(one) for one in (loan.value, loan.base))
-        is_small = loan.name == names.TIP_BIAS_VOLTAGE and value is not None and base is not None
+        is_small = loan.value.name == names.TIP_BIAS_VOLTAGE and value is not None and base is not None
         level = "CRITICAL" if is_small and abs(value or 0.0) < 0.1 * abs(base or 0.0) else "WARNING"
         draft.log(level, f"in force, and set back after `afspm continue` unless you set it: {loan.text}")

@@ -24,6 +24,7 @@ from afspm.model import (
     Response,
     names,
 )
+from afspm.model.requests import AS_PLANNED_REQUEST, KEEP_REQUEST, Settings
 from afspm.plugins.web.dashboard.access import Access, Visitor
 from afspm.plugins.web.person_commands import PersonCommands
 from afspm.plugins.web.persons import Persons
@@ -101,6 +102,12 @@ class Actions:
             raise AfspmError(refusal(response))
         facts: Plain = json.loads(response.payload)
         return facts
+
+    def settle_plan(self, parameter: str, *, keeps: bool) -> ActionResult:
+        """Let plans measure with the value that a person has set in MANUAL, or with the one that they state."""
+        kind, with_ = (KEEP_REQUEST, "the value that was set") if keeps else (AS_PLANNED_REQUEST, "their own value")
+        response = self._commands.request(kind, Settings.of(Parameter(parameter)))
+        return _result(response, f"Plans measure with {with_} of {parameter}")
 
     def scan_speed_m_s(self) -> float | None:
         """Return the scan speed in force; None if the microscope does not have it."""

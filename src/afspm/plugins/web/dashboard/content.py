@@ -23,6 +23,7 @@ from afspm.model import (
     Region,
     TipStatus,
 )
+from afspm.model.requests import Overruling
 from afspm.night import OVER, Overview, ScanSummary, Span, Timeline, instrument_curves
 from afspm.plugins.web.dashboard.charts import Chart, drift_chart
 from afspm.plugins.web.dashboard.flags import Flag, flags
@@ -81,6 +82,7 @@ class Content:
     log: tuple[LogLine, ...] = ()
     is_manual: bool = False
     by_hand: str = ""
+    overruled: tuple[Overruling, ...] = ()
     tip: TipStatus | None = None
     adjustable: tuple[str, ...] = ()
     set_ns: Mapping[str, int] = field(default_factory=dict)
@@ -153,6 +155,7 @@ class Contents:
                 log=tuple(overview.log),
                 is_manual=control is not None and control.mode is ControlMode.MANUAL,
                 by_hand=overview.by_hand,
+                overruled=overview.overruled,
                 tip=overview.tip,
                 adjustable=self._adjustable,
                 set_ns=dict(overview.set_ns),

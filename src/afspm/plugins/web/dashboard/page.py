@@ -21,7 +21,7 @@ from afspm.plugins.web.dashboard.content import Content, Contents
 from afspm.plugins.web.dashboard.page_parts import page_part
 from afspm.plugins.web.dashboard.panels import AlarmBar, ChartPanel, HealthPanel, LogPanel, NotesPanel, SpectraPanel
 from afspm.plugins.web.dashboard.sign_in import SIGN_IN
-from afspm.plugins.web.dashboard.steering_panel import ModeButtons, ProblemBar, SteeringPanel
+from afspm.plugins.web.dashboard.steering_panel import ModeButtons, ProblemBar, SettingsBar, SteeringPanel
 from afspm.plugins.web.dashboard.steering_session import SteeringSession
 from afspm.plugins.web.watch import Audience, Watch
 
@@ -102,6 +102,7 @@ class Page:
                 button.props('flat round dense aria-label="Light or dark"')
                 self._sign_in_or_out()
         self._problems = ProblemBar(self._session)
+        self._settings = SettingsBar(self._session)
         self._alarms = AlarmBar()
         approvals = page_part("approvals")
         self._approvals = approvals and approvals(self._session)
@@ -129,6 +130,7 @@ class Page:
         self._status.set_content(content.status)
         self._mode.show()
         self._problems.show()
+        self._settings.show()
         self._alarms.show(content.alarms)
         if self._approvals:
             self._approvals.show()

@@ -12,6 +12,7 @@ from nicegui import events, ui
 from afspm.basics import PlainMapping, time_of_day, typeset_position
 from afspm.drawing import tint_class
 from afspm.model import ControlMode, Region, TipStatus
+from afspm.model.requests import Overruling
 from afspm.plugins.web.dashboard.actions import Actions
 from afspm.plugins.web.dashboard.content import Content
 from afspm.plugins.web.dashboard.flags import Flag
@@ -91,6 +92,34 @@ class ProblemBar:
             self._session.do(lambda a: a.clear(numbers[0]))
         else:
             self._session.do(lambda a: a.clear_all(numbers))
+
+
+class SettingsBar:
+    """A line for each value in the place of a plan's, and in MANUAL for each one that a plan would set again."""
+
+    def __init__(self, session: SteeringSession) -> None:
+        self._session = session
+        self._shown: tuple[object, ...] = ()
+        self._box = ui.element("div").classes("problems approvals")
+        self._box.set_visibility(False)
+
+    def show(self) -> None:
+        found, may = self._session.content.overruled, self._session.may_steer
+        if (found, may) == self._shown:
+            return
+        self._shown = (found, may)
+        self._box.set_visibility(bool(found))
+        self._box.clear()
+        with self._box:
+            for one in found:
+                with ui.element("div").classes("flag"):
+                    what = "After you hand back" if one.is_asked else "Not as planned"
+                    ui.html(f'<b data-part="setting">{what}</b> <small>{escape(one.text)}</small>', sanitize=False)
+                    if may:
+                        button("Keep mine" if one.is_asked else "As planned", partial(self._settle, one))
+
+    def _settle(self, one: Overruling) -> None:
+        self._session.do(lambda a: a.settle_plan(one.planned.name, keeps=one.is_asked))
 
 
 def _by_hand_html(by_hand: str, remedy: str) -> str:
