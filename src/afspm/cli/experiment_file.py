@@ -47,6 +47,7 @@ def check(
     from rich.console import Console
 
     from afspm.experiment import load
+    from afspm.experiment.setting_notes import SettingNotes
 
     experiment = load(*files)
     findings = experiment.check()
@@ -70,6 +71,7 @@ def check(
                 console.print(line, markup=False, soft_wrap=True)
             for line in experiment.notes():
                 console.print(line, markup=False, soft_wrap=True)
+            show(SettingNotes(experiment.resolved).all(), console)
     if any(finding.is_error for finding in findings):
         raise typer.Exit(1)
 

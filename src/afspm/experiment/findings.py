@@ -10,10 +10,11 @@ from enum import Enum
 
 
 class Level(Enum):
-    """The severity of a finding: an error keeps the experiment from starting; a warning does not."""
+    """The severity of a finding: an error keeps the experiment from starting; a note is of `afspm check` alone."""
 
     ERROR = "error"
     WARNING = "warning"
+    NOTE = "note"
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class SourceLocation:
 
 @dataclass(frozen=True)
 class Finding:
-    """One error or warning about an experiment file."""
+    """One error, warning or note about an experiment file."""
 
     level: Level
     what: str

@@ -72,6 +72,7 @@ def test_a_switch_of_a_section_is_true_or_false(write: Write) -> None:
     [
         (SERIES + SIZE, 'parameters = { scan-speed = "20 um/s" }'),
         (SURVEY + 'zoom = "1 um"\n', 'zoom_parameters = { scan-speed = "20 um/s" }'),
+        ('[sweep]\ncomponent = true\nclass = "Sweep"\n', 'parameters = { scan-speed = ["2 um/s", "20 um/s"] }'),
     ],
 )
 def test_parameters_of_a_plan_are_checked_against_the_limits(write: Write, plan: str, setting: str) -> None:
