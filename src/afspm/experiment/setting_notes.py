@@ -132,10 +132,12 @@ class SettingNotes:
                 yield self._note(low, _BIAS, what, f"state a lower {_SETPOINT} in [{low}] if the distance matters")
 
     def _through_zero(self) -> Iterator[Finding]:
+        if any("bias_through_zero" in one.settings for one in self._resolved.with_role(Role.TRANSLATOR)):
+            return
         zero = "passes zero, where a feedback on the current drives the tip to the sample"
         signs = {name: {bias > 0.0 for bias in self._numbers(name, _BIAS) if bias} for name in self._plans}
         above, below = ([name for name, found in signs.items() if found == {sign}] for sign in (True, False))
-        hint = "use one sign in a run; else begin one plan `after` the other, and put the bias first in a sweep"
+        hint = 'choose bias_through_zero = "hold" in [microscope] if the bias is ramped there, else "jump"'
         if above and below:
             what = f"{_BIAS} is above zero in {_listed(above)}, below in {_listed(below)}: between them it {zero}"
             yield self._note(below[0], _BIAS, what, hint)

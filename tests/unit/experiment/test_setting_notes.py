@@ -123,9 +123,10 @@ def test_bias_that_passes_zero_has_a_note(write: Write) -> None:
     loop = sweep("loop", 'tip-bias-voltage = ["-1 V", "0 V", "1 V"]')
     assert [note.what for note in notes(write(two, frame=CURRENT))] == [between]
     assert [note.hint for note in notes(write(loop, frame=CURRENT))] == [
-        "use one sign in a run; else begin one plan `after` the other, and put the bias first in a sweep"
+        'choose bias_through_zero = "hold" in [microscope] if the bias is ramped there, else "jump"'
     ]
-    for text, frame in ((two, AMPLITUDE), (loop, AMPLITUDE), (loop.replace('"-1 V", ', ""), CURRENT)):
+    chosen = CURRENT + 'bias_through_zero = "hold"\n'
+    for text, frame in ((two, AMPLITUDE), (two, chosen), (loop, AMPLITUDE), (loop.replace('"-1 V", ', ""), CURRENT)):
         assert notes(write(text, frame=frame)) == []
 
 
