@@ -152,13 +152,14 @@ class HeldZ:
             Refused: z can't be held, the bias is refused, or the feedback is not on again: the tip is then withdrawn.
             an error in `LOST`: the way back of a held z follows.
         """
-        self._hold(is_asked=False)
         try:
+            self._hold(is_asked=False)
             found = set_bias()
         except LOST:
             raise
-        except Exception:  # raised again: `apply` has set the bias back, and z has not moved
-            self._switch_on(self._kept[_KEY])
+        except Exception:  # raised again: `apply` has set the bias back; where a tip lift moved z, the feedback ends it
+            if self._found is not None:
+                self._switch_on(self._found)
             raise
         self._kept[_KEY]["former"] |= {name: value for name, value in found.items() if name in _RESTORED}
         self._switch_on(self._kept[_KEY])

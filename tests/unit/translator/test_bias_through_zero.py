@@ -108,3 +108,20 @@ def test_way_back_follows_a_lost_controller_and_no_measurement_is_refused_for_it
     until_free(scope)
     assert (get(scope, ON), number(scope, BIAS)) == ("true", 0.1)
     assert act(scope, names.START_SCAN).ok
+
+
+def test_tip_that_is_lifted_as_the_feedback_goes_off_is_at_the_setpoint_again(bench: Any, tmp_path: Path) -> None:
+    scope = microscope(bench, tmp_path, "hold")
+    z_m = scope.microscope.in_force([names.TIP_Z])[names.TIP_Z]
+    shown = scope.microscope.in_force
+
+    def in_force(wanted: Any) -> dict[str, Any]:
+        found = dict(shown(wanted))
+        is_off = (ON, False) in scope.microscope.sets and (ON, True) not in scope.microscope.sets
+        return found | ({names.TIP_Z: z_m + 1e-9} if is_off and names.TIP_Z in found else {})
+
+    scope.microscope.in_force = in_force
+    assert "switch a tip lift of the controller off" in set_bias(scope, -0.5).reason
+    assert sets(scope) == [(ON, False), (ON, True)]
+    assert (get(scope, ON), number(scope, BIAS)) == ("true", 0.1)
+    assert act(scope, names.START_SCAN).ok
