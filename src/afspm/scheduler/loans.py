@@ -24,7 +24,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from afspm.basics.frozen import replace, without
-from afspm.basics.units import convert
+from afspm.basics.units import in_si
 from afspm.model import Parameter, names
 from afspm.model.requests import LoanInForce, LoansInForce, Setting
 
@@ -49,6 +49,7 @@ class Loan:
         is_over: whether it is set back as soon as possible.
         is_unsure: whether others may have changed the value since it was lent.
         is_watched: whether the run was AUTOMATED and in contact since: another value is then a person's.
+        is_carried: whether the value follows from another one that has changed since.
         why: why it could not be set back; empty: nothing is known against it.
     """
 
@@ -60,6 +61,7 @@ class Loan:
     is_over: bool = False
     is_unsure: bool = False
     is_watched: bool = True
+    is_carried: bool = False
     why: str = ""
 
     @property
@@ -139,8 +141,10 @@ class LoanBook:
             if (found := settings.get(loan.name)) is None:
                 continue
             there = next((one for one in (loan.value, loan.before) if one in found.known), None)
+            if there is None and loan.is_carried and loan.base not in found.known:
+                there = found.parameter
             if there is not None:
-                sure = replace(loan, value=there, before=None, is_unsure=False, is_watched=True)
+                sure = replace(loan, value=there, before=None, is_unsure=False, is_watched=True, is_carried=False)
                 book = book if sure == loan else book._with(key, sure)
                 continue
             book = replace(book, loans=without(book.loans, key))
@@ -185,7 +189,9 @@ class LoanBook:
         return (
             self
             if loan is None
-            else self._with(key, replace(loan, value=value, before=None, is_unsure=False, is_watched=True))
+            else self._with(
+                key, replace(loan, value=value, before=None, is_unsure=False, is_watched=True, is_carried=False)
+            )
         )
 
     def gone(self, keys: Iterable[str]) -> LoanBook:
@@ -228,10 +234,10 @@ class LoanBook:
         }
         return self if loans == self.loans else replace(self, loans=loans)
 
-    def unwatched(self, name: str) -> LoanBook:
-        """Return the book when a value may have changed without a decision about it."""
-        unwatched = {key: replace(loan, is_watched=False) for key, loan in self.loans.items() if loan.name == name}
-        return replace(self, loans={**self.loans, **unwatched}) if unwatched else self
+    def carried(self, name: str) -> LoanBook:
+        """Return the book when a value may have changed with another one, without a decision about it."""
+        carried = {key: replace(loan, is_carried=True) for key, loan in self.loans.items() if loan.name == name}
+        return replace(self, loans={**self.loans, **carried}) if carried else self
 
     def used(self, now_ns: int) -> LoanBook:
         """Return the book after a request for settings: the microscope is idle since then."""
@@ -260,8 +266,8 @@ def equal(a: Parameter, b: Parameter) -> bool:
         first, second = float(a.value or ""), float(b.value or "")
     except ValueError:
         return a.value == b.value
-    if a.unit and b.unit and a.unit != b.unit:
-        second = float(convert(second, b.unit, a.unit))
+    if a.unit != b.unit:
+        first, second = (float(in_si(x, one.unit)[0]) if one.unit else x for x, one in ((first, a), (second, b)))
     return abs(first - second) <= _ROUNDED * max(abs(first), abs(second))
 
 

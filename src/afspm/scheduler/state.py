@@ -131,7 +131,7 @@ class SchedulerState:
             self.loans.loans,
             self.loans.lent_last,
             self.plans.stated,
-            self.plans.overruled,
+            self.plans.rules,
         )
 
     def due_s(self) -> float | None:
@@ -276,7 +276,7 @@ def saved_state(state: SchedulerState, env: Environment) -> SavedState:
         panel=state.panel,
         loans=state.loans.loans,
         lent_last=state.loans.lent_last,
-        plans=replace(state.plans, measured="", bases={}, found={}),
+        plans=state.plans.saved,
     )
 
 

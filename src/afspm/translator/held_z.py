@@ -158,12 +158,23 @@ class HeldZ:
         except LOST:
             raise
         except Exception:  # raised again: `apply` has set the bias back; where a tip lift moved z, the feedback ends it
-            if self._found is not None:
-                self._switch_on(self._found)
+            hold = self._found
+            if hold is not None and not hold.get("is_asked", True):
+                self._break_off(hold)
             raise
-        self._kept[_KEY]["former"] |= {name: value for name, value in found.items() if name in _RESTORED}
-        self._switch_on(self._kept[_KEY])
+        hold = self._kept[_KEY]
+        hold["former"] |= {name: value for name, value in found.items() if name in hold["former"]}
+        self._switch_on(hold)
         return found
+
+    def _break_off(self, hold: Plain) -> None:
+        # only at the bias of before does the feedback find the tip where it left it
+        now = self._driver.in_force(hold["former"])
+        off = [name for name, value in hold["former"].items() if not self._driver.same(name, now[name], value, now)]
+        if off:
+            self._fail(hold, f"{off[0]} reads {self._driver.table[off[0]].quantity(now[off[0]])}")
+        else:
+            self._switch_on(hold)
 
     def _switch_on(self, found: Plain) -> None:
         try:
@@ -181,7 +192,8 @@ class HeldZ:
         driver = self._driver
         self._refuse_hold()
         self._kept.pop(_ENDED, None)
-        restored = [name for name in _RESTORED if name in driver.table and not driver.table[name].read_only]
+        wanted = _RESTORED if is_asked else (*_RESTORED, names.SAMPLE_BIAS)
+        restored = [name for name in wanted if name in driver.table and not driver.table[name].read_only]
         former = driver.in_force(restored)
         before_m = self._mean_z_m()
         now_s = driver.clock.now_s()

@@ -478,6 +478,13 @@ def test_no_step_of_a_bias_ends_near_zero(start: float, end: float) -> None:
     assert sum(a * b < 0.0 for a, b in itertools.pairwise(way)) == 1
 
 
+def test_bias_passes_zero_at_a_controller_that_rounds() -> None:
+    desk = Desk(limited(tip_bias_voltage=Limit(step=0.1, unit="V")))
+    desk.rounds = 20 / 65536
+    assert desk.measures("b", **B).ok
+    assert min(abs(float(value)) for _, value in desk.sets) >= 0.04
+
+
 def test_value_beyond_its_range_is_refused_before_the_first_step_to_it() -> None:
     desk = Desk(limited(tip_bias_voltage=Limit(high=3.0, step=0.25, unit="V")))
     assert "above the highest allowed, 3 V" in desk.measures("a", tip_bias_voltage="4 V").reason

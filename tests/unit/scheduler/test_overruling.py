@@ -14,6 +14,8 @@ from afspm.model import (
     PanelAct,
     Parameter,
     Problem,
+    ProcessCondition,
+    ProcessState,
     names,
 )
 from afspm.model.bias import BiasReference
@@ -22,7 +24,7 @@ from afspm.model.requests import AS_PLANNED_REQUEST, KEEP_REQUEST, LEND_REQUEST,
 from afspm.scheduler.control.arbitration import RoleTable, Rules
 from afspm.scheduler.events import TranslatorDown
 from afspm.scheduler.safety.limits import ExperimentLimits, Limit
-from afspm.scheduler.settings import SchedulerSettings
+from afspm.scheduler.settings import ControlSettings, SchedulerSettings
 
 BAD = Problem.FEEDBACK_NON_OPTIMAL
 LEFT = "a sets tip-bias-voltage 500 mV again (you left 700 mV)"
@@ -230,8 +232,8 @@ def test_what_a_solver_sets_and_sets_back_overrules_nothing(values: tuple[str, .
 
 def test_finding_is_for_the_plan_that_was_found_bad_alone() -> None:
     desk = Desk()
-    desk.measures("b", zctrl_igain="5")
-    desk.measures("a", zctrl_igain="5")
+    for name in ("b", "a", "a"):
+        desk.measures(name, zctrl_igain="5")
     solves(desk, "40")
     desk.measures("b", zctrl_igain="5")
     desk.measures("a", zctrl_igain="5")
@@ -329,3 +331,157 @@ def test_value_that_may_be_rounded_by_a_translator_of_another_make_is_a_base_alo
     desk.panel[BIAS] = 0.5001
     desk.measures("a", **A)
     assert (desk.measured[-1][BIAS], overruled(desk)) == (0.5, [])
+
+
+# --- again, and at its borders ---
+
+
+def page_desk() -> Desk:
+    rules = Rules(RoleTable(operate=("page",)), adjustable=frozenset((GAIN, BIAS)))
+    return Desk(SchedulerSettings(control=QUICK, rules=rules))
+
+
+def test_gain_that_is_turned_down_twice_is_the_second_one() -> None:
+    desk = page_desk()
+    desk.measures("a", zctrl_igain="5")
+    for value in ("2", "1"):
+        assert desk.asked("page:ada", PARAM, Parameter(GAIN, value)).ok
+    desk.measures("a", zctrl_igain="5")
+    assert desk.measured[-1][GAIN] == 1.0
+
+
+def test_knob_that_is_turned_again_while_another_measures_counts() -> None:
+    desk = Desk()
+    desk.measures("a", **A)
+    acts(desk, 0.7)
+    desk.measures("a", **A)
+    desk.measures("c")
+    acts(desk, 0.3, before=0.7)
+    desk.measures("a", **A)
+    assert desk.measured[-1][BIAS] == 0.3
+    acts(desk, 0.5, before=0.3)
+    desk.measures("a", **A)
+    assert (desk.measured[-1][BIAS], overruled(desk)) == (0.5, [])
+
+
+@pytest.mark.parametrize(("bad", "right"), [("a", [40.0, 20.0]), ("b", [5.0, 40.0]), ("", [5.0, 20.0])])
+def test_finding_during_the_next_plans_scan_is_for_the_plan_whose_settings_the_solver_states(
+    bad: str, right: list[float]
+) -> None:
+    desk, gains = Desk(), {"a": "5", "b": "20"}
+    for name in ("a", "b"):
+        desk.measures(name, zctrl_igain=gains[name])
+    desk.says("watch", ControlRequest.ADD_EXP_PRBLM, int(BAD))
+    desk.says("tuner", ControlRequest.REQUEST_CTRL, int(BAD))
+    desk.serve()
+    if bad:
+        assert desk.lends("tuner", zctrl_igain=gains[bad]).ok
+    assert desk.asked("tuner", PARAM, Parameter(GAIN, "40")).ok
+    desk.says("tuner", ControlRequest.RMV_EXP_PRBLM, int(BAD))
+    desk.says("tuner", ControlRequest.RELEASE_CTRL)
+    for name in ("a", "b"):
+        desk.measures(name, zctrl_igain=gains[name])
+    assert [one[GAIN] for one in desk.measured[-2:]] == right
+
+
+def test_value_set_back_by_a_controller_that_rounds_is_no_finding() -> None:
+    desk = Desk()
+    desk.rounds = 20 / 65536
+    desk.measures("a", **A)
+    desk.says("watch", ControlRequest.ADD_EXP_PRBLM, int(BAD))
+    desk.says("tuner", ControlRequest.REQUEST_CTRL, int(BAD))
+    desk.serve()
+    for value in ("3", "0.1"):
+        desk.asked("tuner", PARAM, Parameter(BIAS, value, "V"))
+    desk.says("tuner", ControlRequest.RMV_EXP_PRBLM, int(BAD))
+    desk.serve()
+    assert overruled(desk) == []
+
+
+def test_gain_that_is_the_base_by_now_is_found_for_a_second_plan_too() -> None:
+    desk = Desk()
+    desk.measures("a", zctrl_igain="5")
+    solves(desk, "40")
+    desk.measures("b", zctrl_igain="20")
+    desk.measures("b", zctrl_igain="20")
+    solves(desk, "40")
+    desk.measures("b", zctrl_igain="20")
+    assert desk.measured[-1][GAIN] == 40.0
+
+
+def test_value_beyond_the_limits_is_not_kept() -> None:
+    desk = Desk(limited(tip_bias_voltage=Limit(low=-1.0, high=1.0, unit="V")))
+    desk.measures("a", **A)
+    desk.mode("ada", ControlMode.MANUAL)
+    acts(desk, 3.0)
+    assert not desk.asked("terminal:ada", KEEP_REQUEST, Settings()).ok
+    acts(desk, 0.5, before=3.0)
+    desk.mode("ada", ControlMode.AUTOMATED)
+    assert desk.measures("a", **A).ok
+
+
+def test_act_that_leads_to_manual_and_a_feedback_set_in_it_are_listed() -> None:
+    desk = Desk(SchedulerSettings(control=ControlSettings(settle_s=0.0, changed_by_hand="pause")))
+    desk.measures("a", **A, zctrl_igain="5")
+    desk.publish("ZCtrlParameters", Feedback(integral_gain=5.0))
+    acts(desk, 0.7)
+    assert shown(desk) == [LEFT]
+    desk.publish("ZCtrlParameters", Feedback(integral_gain=3.0))
+    assert set(shown(desk)) == {LEFT, "a sets zctrl-igain 5 again (you left 3)"}
+
+
+def test_plan_that_is_given_up_is_overruled_no_more() -> None:
+    desk = Desk()
+    desk.measures("a", **A)
+    desk.panel[BIAS] = 0.7
+    desk.measures("a", **A)
+    desk.give_up("a")
+    desk.serve()
+    assert shown(desk) == []
+
+
+def test_frame_of_the_run_is_no_decision_about_a_speed_behind_which_stands_a_line_rate() -> None:
+    desk = Desk()
+    desk.measures("a", scan_speed="2 um/s")
+    desk.take_control("b")
+    desk.panel[names.SCAN_SIZE_X] = 1e-7
+    assert desk.asked("b", PARAM, Parameter(names.SCAN_SIZE_X, "2e-7", "m")).ok
+    desk.panel[SPEED] = 2.008e-6
+    desk.measures("b", scan_speed="1 um/s")
+    desk.measures("c")
+    desk.measures("a", scan_speed="2 um/s")
+    assert [one[SPEED] for one in desk.measured[1:]] == [1e-6, 1e-6, 2e-6]
+    assert overruled(desk) == []
+
+
+def test_each_of_the_values_of_a_survey_has_a_place_of_its_own() -> None:
+    desk = Desk()
+    for _ in range(2):
+        desk.measures("a", **A)
+        desk.measures("a", **B)
+    desk.panel[BIAS] = 0.3  # in the place of -1 V
+    for settings in (A, B):
+        desk.measures("a", **settings)
+    desk.panel[BIAS] = 0.4
+    for settings in (A, B):
+        desk.measures("a", **settings)
+    assert [one[BIAS] for one in desk.measured[4:]] == [0.5, 0.3, 0.5, 0.4]
+
+
+def test_value_that_a_script_states_no_more_is_forgotten() -> None:
+    desk = Desk()
+    desk.measures("a", **A)
+    desk.panel[BIAS] = 0.7
+    desk.measures("a", **A)
+    for volts in range(2, 7):
+        desk.measures("a", tip_bias_voltage=f"{volts} V")
+    assert overruled(desk) == []
+    assert len(desk.core.state.plans.stated["a"]) == 4
+
+
+def test_component_keeps_nothing_for_a_person() -> None:
+    desk = Desk()
+    manual_with_a_value(desk)
+    desk.tell(ProcessState("a", "component", ProcessCondition.ALIVE, 1))
+    refused = desk.asked("a", KEEP_REQUEST, Settings())
+    assert "never a component or agent" in refused.reason

@@ -125,3 +125,23 @@ def test_tip_that_is_lifted_as_the_feedback_goes_off_is_at_the_setpoint_again(be
     assert sets(scope) == [(ON, False), (ON, True)]
     assert (get(scope, ON), number(scope, BIAS)) == ("true", 0.1)
     assert act(scope, names.START_SCAN).ok
+
+
+def test_controller_that_shows_its_ramp_gets_no_feedback_on_the_way(bench: Any, tmp_path: Path) -> None:
+    scope = microscope(bench, tmp_path, "hold")
+    sets_it = scope.microscope.put_in_force
+    scope.microscope.put_in_force = lambda values: sets_it({BIAS: 0.02} if BIAS in values else values)
+    assert not set_bias(scope, -0.5).ok
+    assert get(scope, ON) == "false"
+    until_free(scope)
+    assert get(scope, names.ENGAGED) == "false"
+
+
+def test_hold_of_the_run_that_a_person_has_ended_keeps_its_way_back(bench: Any, tmp_path: Path) -> None:
+    scope = microscope(bench, tmp_path, "hold")
+    assert act(scope, names.HOLD_Z).ok
+    assert scope.ask(PARAM, Parameter(BIAS, "0.01", "V")).ok
+    scope.microscope.put_in_force({ON: True})
+    assert not set_bias(scope, -0.5).ok
+    scope.look()
+    assert number(scope, BIAS) == 0.1

@@ -137,6 +137,13 @@ class HandSettings:
     def published(self, feedback: Feedback, *, is_manual: bool) -> HandSettings:
         return replace(self, now=feedback, before=self.before if is_manual and self.before else feedback)
 
+    @property
+    def left(self) -> dict[str, Parameter]:
+        """The values that differ from those of before MANUAL, by name; of the feedback in SI."""
+        before = {one.name: one for one in feedback_values(self.before)}
+        changed = {one.name: one for one in feedback_values(self.now) if before.get(one.name, one) != one}
+        return {**changed, **self.parameters}
+
     def handed_back(self) -> tuple[HandSettings, tuple[str, ...]]:
         """Return emptied settings, and the text of each setting that stays in force after MANUAL."""
         told = [f"{name} = {_value(one.value or '', one.unit or '')}" for name, one in self.parameters.items()]
@@ -146,6 +153,13 @@ class HandSettings:
             if is_changed and parameter not in self.parameters:
                 told.append(f"{word} = {value:g}" if name != "on" else f"{word} {'on' if value else 'off'}")
         return HandSettings(before=self.now, now=self.now), tuple(told)
+
+
+def feedback_values(feedback: Feedback | None) -> tuple[Parameter, ...]:
+    """Return gains and setpoint, as far as they are given, as parameters in SI."""
+    given = {} if feedback is None else {one: getattr(feedback, word) for word, (_, one) in _FEEDBACK_WORDS.items()}
+    given.pop(names.FEEDBACK_ON, None)
+    return tuple(Parameter(name, repr(value)) for name, value in given.items() if value is not None)
 
 
 def request_text(request: Request, problems: ProblemNames) -> str:

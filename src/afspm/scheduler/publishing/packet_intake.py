@@ -26,7 +26,7 @@ from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlInput
 from afspm.scheduler.control.control_change import TRANSLATOR
 from afspm.scheduler.events import PacketIn, Publish
 from afspm.scheduler.publishing.event_log import panel_entry
-from afspm.scheduler.requests import approvals
+from afspm.scheduler.requests import approvals, lending
 from afspm.scheduler.safety import safety_commands
 from afspm.scheduler.safety.movers import MoverState
 from afspm.scheduler.state import StateDraft
@@ -108,22 +108,24 @@ def _update_state(draft: StateDraft, published: object) -> None:
 
 
 def _take_act(draft: StateDraft, act: ActByHand) -> None:
-    is_manual = draft.control.mode is ControlMode.MANUAL
+    is_manual, control = draft.control.mode is ControlMode.MANUAL, draft.env.settings.control
     draft.others_may_have_acted(is_watched=not is_manual)
     if any(one.parameter == names.SCAN_SIZE_X for one in act.changes):
-        # behind the speed of some makers is a line rate: another width is no decision about the speed
-        draft.loans = draft.loans.unwatched(names.SCAN_SPEED)
+        draft.loans = draft.loans.carried(names.SCAN_SPEED)
     draft.limits = draft.limits.seen(Parameter(one.parameter, one.after, one.unit or None) for one in act.changes)
     for one in act.changes:
-        if is_manual:
-            draft.by_hand = draft.by_hand.changed(one)
         changed = Parameter(one.parameter, one.after, one.unit or None)
         draft.panel = draft.panel.with_change(one.parameter, draft.limits.outside(changed))
         draft.limits = draft.limits.in_force(changed, draft.now_ns)
     outside = [draft.panel.outside[one.parameter] for one in act.changes if one.parameter in draft.panel.outside]
     draft.event_log = draft.event_log.add(draft.now_s, panel_entry(draft.now_ns, TRANSLATOR, act, outside))
-    control = draft.env.settings.control
-    if draft.panel.asks_for_pause(act, stopped=control.stopped_by_hand, changed=control.changed_by_hand):
+    pauses = draft.panel.asks_for_pause(act, stopped=control.stopped_by_hand, changed=control.changed_by_hand)
+    for one in act.changes:
+        if is_manual or pauses:  # what leads to MANUAL is set in it
+            draft.by_hand = draft.by_hand.changed(one)
+        else:
+            lending.turned(draft, Parameter(one.parameter, one.after, one.unit or None))
+    if pauses:
         _give_to_person(draft, "; ".join([str(act), *outside]))
 
 

@@ -27,6 +27,7 @@ from afspm.model import (
     Request,
     Response,
     ResponseDetail,
+    component_of,
     names,
 )
 from afspm.model.microscope_status import STOPS
@@ -43,8 +44,10 @@ from afspm.model.requests import (
     amount_text,
 )
 from afspm.model.setting_order import widening_first
+from afspm.scheduler.control.descriptions import feedback_values
 from afspm.scheduler.events import RequestIn
 from afspm.scheduler.loans import SETTLES, Loan, LoanBook, equal, key_of, kind_of, may_be_lent
+from afspm.scheduler.overrulings import Stated
 from afspm.scheduler.publishing.event_log import SCHEDULER
 from afspm.scheduler.publishing.own_packets import publish
 from afspm.scheduler.requests import answers, approvals
@@ -78,7 +81,7 @@ def take_return(draft: StateDraft, event: RequestIn) -> bool:
     """Process a RETURN; return whether it is queued, and answered once all is set back."""
     given = [one.name for one in event.request.subject.parameters]
     draft.loans = draft.loans.returned_by(event.name, given)
-    if not given:
+    if not given and not draft.control.solving:
         draft.plans = draft.plans.ended(event.name)
     if is_to_return(draft.loans) and may_return(draft):
         return True
@@ -502,6 +505,8 @@ def _finish(draft: StateDraft, job: ForwardedRequest, lending: Lending) -> None:
         stated, token = lending.stated, draft.peers.sessions.token(job.client)
         draft.loans = draft.loans.stating(job.client, token, {key_of(one.name, lending.kind): one for one in stated})
         draft.plans = draft.plans.stating(job.client, *_planned(draft, job, lending))
+        if draft.control.solving:
+            draft.plans = draft.plans.solving(draft.loans.stated)
         given = tuple(_answered(draft, job, lending, one) for one in _asked(job))
         payload = draft.env.codec.encode(Settings(given))
         if job.client == draft.control.holder:
@@ -566,13 +571,13 @@ def _asked(job: ForwardedRequest) -> tuple[Setting, ...]:
 
 
 def _stated(draft: StateDraft, job: ForwardedRequest, kind: str) -> tuple[Parameter, ...]:
-    # each with what takes its place, which no point of a sweep has
-    return tuple(
-        one.parameter
-        if one.is_swept
-        else draft.plans.instead(job.client, key_of(one.parameter.name, kind), one.parameter)
-        for one in _asked(job)
-    )
+    # each with what takes its place: not that of a point of a sweep, and nothing that limits refuse by now
+    found = []
+    for one in _asked(job):
+        value = draft.plans.instead(job.client, key_of(one.parameter.name, kind), one.parameter)
+        is_allowed = value == one.parameter or not (one.is_swept or draft.limits.beyond_range(value))
+        found.append(value if is_allowed else one.parameter)
+    return tuple(found)
 
 
 def _values_of(compared: Mapping[str, Setting]) -> dict[str, Parameter | None]:
@@ -590,24 +595,40 @@ def begun(draft: StateDraft, client: str) -> None:
     """Note that a measurement or treatment has begun, with what its client had stated for it."""
     if not draft.control.solving:
         bases = {key: loan.base for key, loan in draft.loans.loans.items() if key in draft.loans.stated}
-        draft.plans = draft.plans.begun(client, bases)
+        draft.plans = draft.plans.beginning(client, bases)
     draft.loans = draft.loans.nothing_stated()
 
 
 def decided(draft: StateDraft, job: ForwardedRequest, answered: Parameter | None) -> None:
     """Note what a client has set outside of a measurement: a base, and of a person or solver more than that."""
-    kind = draft.limits.kind_of_curve
-    if job.is_by_hand or not (draft.control.solving or _is_person(draft, job.client)):
-        draft.loans = draft.loans.decided(draft.limits.names_set_by(job.outgoing), kind)
-        return
-    for name, value in _values_set(job.outgoing, answered).items():
-        key = key_of(name, kind)
-        if job.client == draft.control.holder and draft.control.solving:
-            draft.plans = draft.plans.finding(key, value)
-        elif (loan := draft.loans.loans.get(key)) is not None and _is_person(draft, job.client):
-            draft.plans, notes = draft.plans.decided(key, value, loan.lender, f"by {job.client}")
-            _say(draft, notes)
-    draft.loans = draft.loans.decided(draft.limits.names_set_by(job.outgoing), kind)
+    kind, names_set = draft.limits.kind_of_curve, draft.limits.names_set_by(job.outgoing)
+    if names.SCAN_SIZE_X in names_set and names.SCAN_SPEED not in names_set:
+        draft.loans = draft.loans.carried(names.SCAN_SPEED)  # behind the speed of some makers is a line rate
+    is_solver = bool(draft.control.solving) and job.client == draft.control.holder
+    for asked in () if job.is_by_hand else _values_set(job.outgoing):
+        is_answer = answered is not None and answered.name == asked.name and answered.value is not None
+        value = answered if answered is not None and is_answer else asked
+        if is_solver:
+            draft.plans = draft.plans.finding(key_of(asked.name, kind), asked, value)
+        elif _is_person(draft, job.client):
+            _overrule(draft, value, f"by {job.client}")
+    draft.loans = draft.loans.decided(names_set, kind)
+
+
+def turned(draft: StateDraft, value: Parameter) -> None:
+    """Note a value that a person has set at the panel in AUTOMATED: the next look finds one that is lent."""
+    if key_of(value.name, draft.limits.kind_of_curve) not in draft.loans.loans:
+        _overrule(draft, value, "at the microscope")
+
+
+def _overrule(draft: StateDraft, value: Parameter, by: str) -> None:
+    key = key_of(value.name, draft.limits.kind_of_curve)
+    loan = draft.loans.loans.get(key)
+    if loan is None:
+        draft.plans, notes = draft.plans.newer(key, value, by)
+    else:
+        draft.plans, notes = draft.plans.decided(key, value, loan.lender, by)
+    _say(draft, notes)
 
 
 def _is_person(draft: StateDraft, client: str) -> bool:
@@ -615,32 +636,25 @@ def _is_person(draft: StateDraft, client: str) -> bool:
     return client != draft.control.holder and not draft.env.settings.rules.is_agent(client)
 
 
-def _values_set(request: Request, answered: Parameter | None) -> dict[str, Parameter]:
+def _values_set(request: Request) -> tuple[Parameter, ...]:
     subject = request.subject
     if isinstance(subject, Parameter):
-        is_answer = answered is not None and answered.name == subject.name and answered.value is not None
-        return {subject.name: answered if answered is not None and is_answer else subject}
-    if not isinstance(subject, Feedback):
-        return {}
-    given = {
-        names.ZCTRL_PGAIN: subject.proportional_gain,
-        names.ZCTRL_IGAIN: subject.integral_gain,
-        names.ZCTRL_SETPOINT: subject.setpoint,
-    }
-    return {name: Parameter(name, repr(value)) for name, value in given.items() if value is not None}
+        return (subject,)
+    return feedback_values(subject) if isinstance(subject, Feedback) else ()
 
 
-def _left(draft: StateDraft) -> tuple[Overruling, ...]:
+def _left(draft: StateDraft) -> list[tuple[Stated, Overruling]]:
     if draft.control.mode is not ControlMode.MANUAL:
-        return ()
-    return draft.plans.left(draft.by_hand.parameters, draft.limits.kind_of_curve)
+        return []
+    left = draft.plans.left(draft.by_hand.left, draft.limits.kind_of_curve)
+    return [(stated, one) for stated, one in left if not draft.limits.beyond_range(one.value)]
 
 
 def refusal_to_overrule(draft: StateDraft, event: RequestIn) -> str:
     """Carry out a person's KEEP or AS_PLANNED; return why it is refused, empty if it is not."""
     who, kept = event.name, event.request.kind == KEEP_REQUEST
-    if draft.env.settings.rules.is_agent(who):
-        return "a person decides what takes the place of a plan's values, and never an agent"
+    if draft.env.settings.rules.is_agent(who) or draft.peers.supervisors.starts_of(who) is not None:
+        return "a person decides what takes the place of a plan's values, and never a component or agent"
     given = [one.name for one in event.request.subject.parameters]
     if not kept:
         draft.plans = draft.plans.as_planned(given)
@@ -648,8 +662,10 @@ def refusal_to_overrule(draft: StateDraft, event: RequestIn) -> str:
         return ""
     if draft.control.mode is not ControlMode.MANUAL:
         return "values are kept before the run continues: the mode is AUTOMATED"
-    left = [one for one in _left(draft) if not given or one.planned.name in given]
-    draft.plans, notes = draft.plans.keeping(left, draft.limits.kind_of_curve, who)
+    left = [(stated, one) for stated, one in _left(draft) if not given or stated.parameter.name in given]
+    if not left:
+        return "no plan would set another value than those that were set in MANUAL"
+    draft.plans, notes = draft.plans.keeping(left, who)
     _say(draft, notes)
     return ""
 
@@ -672,6 +688,9 @@ def may_return(draft: StateDraft) -> bool:
 
 def begin_returns(draft: StateDraft) -> None:
     """Queue a RETURN of the scheduler itself, once loans are over and may be set back."""
+    for lender in draft.plans.stated:
+        if draft.peers.supervisors.over_since_s(component_of(lender)) is not None:
+            draft.plans = draft.plans.ended(lender)
     book = draft.loans
     if not book.loans:
         return
@@ -724,7 +743,7 @@ def publish_changes(draft: StateDraft) -> None:
     if book.shown is not None and all(one is other for one, other in zip(now, then, strict=True)):
         return
     is_on_its_way = turn is not None and turn.lending is not None and not turn.lending.is_done
-    shown = LoansInForce(book.in_force, (*draft.plans.in_force, *_left(draft)))
+    shown = LoansInForce(book.in_force, (*draft.plans.in_force, *(one for _, one in _left(draft))))
     if is_on_its_way or shown == book.shown or draft.barrier.until_s is not None:
         return
     draft.loans = replace(book, shown=shown)

@@ -54,6 +54,7 @@ from afspm.scheduler.safety.limits import ExperimentLimits, ForbiddenState, Limi
 from afspm.scheduler.safety.movers import MoverSettings, MoverState
 from afspm.scheduler.safety.parameter_values import ParameterValue, ParameterValueError, numbers, values_of
 
+_ROUNDED_OF_STEP = 0.1
 _REACH = 1e-9  # relative: a value on the border, to the precision of the arithmetic, is inside
 _ROUNDED = 0.01  # of the largest step of a stage: how far it rounds a target
 _TOLD_REACH = 1e-3  # the same for a place read from a controller, which rounds to its steps and to single precision
@@ -759,6 +760,6 @@ def _has_value_of(reported: Parameter, asked: Parameter) -> bool:
 def _beside_zero(start: float, end: float, step: float) -> float:
     # no step of a bias ends near 0 V, where a feedback drives the tip into the sample: one passes it from side to side
     near = min(step / 2.0, abs(start), abs(end))
-    if abs(start) > near * (1 + _REACH):
+    if abs(start) - near > _ROUNDED_OF_STEP * step:  # a controller that rounds is beside it
         return math.copysign(near, start)
-    return math.copysign(min(step - near, abs(end)), end)
+    return math.copysign(min(step - abs(start), abs(end)), end)
