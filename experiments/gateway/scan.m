@@ -11,10 +11,11 @@ addpath(fileparts(mfilename('fullpath')));  % afspm_ask.m
 state = afspm_ask(address, name, 'get', '/state');
 fprintf('%s, the microscope is %s\n', state.mode, state.microscope.state);
 afspm_ask(address, name, 'post', '/control?wait_s=20');  % with the usual lease of 60 s
-afspm_ask(address, name, 'put', '/parameters/tip-bias-voltage', struct('value', '500 mV'));
 region = struct('center_m', [1e-6 0], 'size_m', [5e-7 5e-7]);
+settings = containers.Map('tip-bias-voltage', '500 mV');  % no field of a struct has a hyphen in its name
 key = [name '-1'];
-afspm_ask(address, name, 'post', '/scans', struct('region', region, 'shape', [64 64], 'key', key));
+afspm_ask(address, name, 'post', '/scans', ...
+          struct('region', region, 'shape', [64 64], 'settings', settings, 'key', key));
 measured.state = 'running';
 while strcmp(measured.state, 'running')
   measured = afspm_ask(address, name, 'get', ['/measurements/' key '?wait_s=20']);

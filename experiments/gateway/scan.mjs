@@ -36,9 +36,8 @@ const state = await ask("GET", "/state");
 console.log(`${state.mode}, ${state.holder ?? "nobody"} is in control, the microscope is ${state.microscope.state}`);
 await ask("POST", "/control?wait_s=20", { lease_s: 60 });
 try {
-  await ask("PUT", "/parameters/tip-bias-voltage", { value: 0.5, unit: "V" });
   const region = { center_m: [1e-6, 0], size_m: [5e-7, 5e-7] };
-  await ask("POST", "/scans", { region, shape: [64, 64], key: `${name}-1` });
+  await ask("POST", "/scans", { region, shape: [64, 64], settings: { "tip-bias-voltage": 0.5 }, key: `${name}-1` });
   for await (const event of events(["state", "scan"], state.last_event)) {
     console.log(event.kind, event.data.state ?? event.data.channel);
     const measured = await ask("GET", `/measurements/${name}-1`);

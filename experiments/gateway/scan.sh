@@ -13,8 +13,8 @@ ask() {  # METHOD PATH [JSON]: prints the answer; a refusal says why, and ends t
 ask GET /state
 ask POST "/control?wait_s=20" '{"lease_s": 60}'
 trap 'ask DELETE /control' EXIT
-ask PUT /parameters/tip-bias-voltage '{"value": "500 mV"}'
-ask POST /scans '{"region": {"center_m": [1e-6, 0], "size_m": [5e-7, 5e-7]}, "shape": [64, 64], "key": "'"$name-1"'"}'
+ask POST /scans '{"region": {"center_m": [1e-6, 0], "size_m": [5e-7, 5e-7]}, "shape": [64, 64],
+    "settings": {"tip-bias-voltage": "500 mV"}, "key": "'"$name-1"'"}'
 until ask GET "/measurements/$name-1?wait_s=20" | tee measured.json | grep -v '"running"'; do :; done
 scan=$(sed 's/.*"result":"\([0-9]*\)".*/\1/' measured.json)
 curl --silent --show-error --fail "$url/scans/$scan/values?channel=Height" --output height.npy

@@ -21,7 +21,7 @@ from afspm.basics.lazy import lazily
 if TYPE_CHECKING:
     from afspm.client.connect import GUEST, find_run, guest_of
     from afspm.client.experiment_link import ExperimentLink
-    from afspm.client.parameter_text import Value, to_parameter
+    from afspm.client.parameter_text import Value, to_parameter, to_settings
     from afspm.client.targets import ScanTarget, SpectrumTarget, Target, xy_of
 
 if TYPE_CHECKING:  # a page's person measures and sets as a script does
@@ -47,6 +47,7 @@ __all__ = [
     "is_set",
     "target_from",
     "to_parameter",
+    "to_settings",
     "value_in",
     "xy_of",
 ]
@@ -59,7 +60,7 @@ if not TYPE_CHECKING:
             "afspm.client.cycle": "Cycle CycleOutcome",
             "afspm.client.experiment_link": "ExperimentLink",
             "afspm.client.measurement": "BEGUN_WITHIN_S",
-            "afspm.client.parameter_text": "Value to_parameter from_parameter value_in",
+            "afspm.client.parameter_text": "Value to_parameter to_settings from_parameter value_in",
             "afspm.client.targets": "ScanTarget SpectrumTarget Target xy_of FITS is_set target_from",
         },
     )

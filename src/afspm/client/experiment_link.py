@@ -26,6 +26,7 @@ from afspm.model import (
     Feedback,
     MeasurementConditions,
     Packet,
+    Parameter,
     ProbePosition,
     RelayedMessage,
     Request,
@@ -40,7 +41,7 @@ from afspm.model import (
     TipStatus,
     request_name,
 )
-from afspm.model.requests import OTHER_RUN_RESPONSE
+from afspm.model.requests import LEND_REQUEST, OTHER_RUN_RESPONSE, RETURN_REQUEST, Settings
 from afspm.model.sessions import run_of
 from afspm.model.state import FeedbackUnits
 from afspm.transport import Port
@@ -460,6 +461,14 @@ class ExperimentLink:
             where=self.name,
             hint="the request may or may not have been carried out",
         )
+
+    def lend(self, settings: Sequence[Parameter], until_s: float | None = None) -> Response:
+        """State the settings of the next measurement, and return the answer, even a refusal. Raises as `request`."""
+        return self.request(LEND_REQUEST, Settings.of(*settings), until_s=until_s)
+
+    def give_back(self, until_s: float | None = None) -> Response:
+        """Let the scheduler set back all that this client has lent. Raises as `request`."""
+        return self.request(RETURN_REQUEST, Settings(), until_s=until_s)
 
     def send_only(self, kind: int, subject: object = None, request_id: str = "") -> None:
         """Send a request without waiting for the answer; without a connection the request is lost."""

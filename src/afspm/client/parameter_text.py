@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from afspm import wire
 from afspm.basics.argument_checks import FINITE, is_text, plain
 from afspm.basics.errors import InvalidValue, UnitError
 from afspm.basics.units import convert, parse_quantity, require_unit
-from afspm.model import Parameter, Response
+from afspm.model import Parameter, Response, is_of_instrument
 from afspm.model.parameter_names import UNITS_OF_REQUESTS
 
 Value = float | str | bool
@@ -38,6 +40,17 @@ def to_parameter(name: str, value: Value, unit: str | None) -> Parameter:
     # the repr of a numpy number is "np.float64(…)"
     text = repr(int(value)) if isinstance(value, int) else repr(float(value))
     return Parameter(name, text, UNITS_OF_REQUESTS.get(name) if unit is None else unit)
+
+
+def to_settings(settings: Mapping[str, Value]) -> dict[str, Parameter]:
+    """Convert the settings of a measurement into parameters by name; raises as `to_parameter`.
+
+    A parameter of another instrument raises InvalidValue.
+    """
+    if others := [name for name in settings if is_of_instrument(name)]:
+        what = f"{others[0]} belongs to another instrument, which takes its time"
+        raise InvalidValue(what, where="settings", hint="sweep it, or set it before the measurement")
+    return {name: to_parameter(name, value, None) for name, value in settings.items()}
 
 
 def from_parameter(parameter: Parameter, unit: str | None) -> Value:

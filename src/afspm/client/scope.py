@@ -25,7 +25,7 @@ from afspm.client.instrument_targets import InstrumentTargets
 from afspm.client.keyed_results import KeyedResults, check_key
 from afspm.client.measurement import MeasurementRunner
 from afspm.client.measurement_setup import MeasurementSetup
-from afspm.client.parameter_text import Value, to_parameter, value_in
+from afspm.client.parameter_text import Value, to_parameter, to_settings, value_in
 from afspm.client.sweeping import Measure, ParameterSweep, SweepPoint
 from afspm.client.sweeping_at import PlacedSweep, PlacedSweeper
 from afspm.client.targets import ScanTarget, SpectrumTarget, Target, xy_of
@@ -207,7 +207,7 @@ class Scope(ExperimentView):
         Raises:
             InvalidValue: a value is not valid, or a parameter is one of another instrument.
         """
-        given, outside = _parameters(settings), (self._lent, self._settle_s)
+        given, outside = to_settings(settings), (self._lent, self._settle_s)
         self._lent = {**self._lent, **given}
         self._settle_s = self._settle_s if settle is None else si_or_text(settle, "s")
         try:
@@ -230,7 +230,7 @@ class Scope(ExperimentView):
             self._link.request(RETURN_REQUEST, Settings(), until_s=self._link.until(timeout_s))
 
     def _carrying(self, target: TargetT, settings: Mapping[str, Value] | None = None) -> TargetT:
-        own = (*target.settings, *_parameters(settings or {}).values())
+        own = (*target.settings, *to_settings(settings or {}).values())
         return replace(target, settings=own, lent=tuple(self._lent.values()), settle_s=self._settle_s)
 
     @contextmanager
@@ -974,13 +974,6 @@ class Scope(ExperimentView):
             response = self._link.request(kind, subject, request_id=request_id)
             if not response.ok:
                 raise refused(kind, response, self._link.name)
-
-
-def _parameters(settings: Mapping[str, Value]) -> dict[str, Parameter]:
-    if others := [name for name in settings if is_of_instrument(name)]:
-        what = f"{others[0]} belongs to another instrument, which takes its time"
-        raise InvalidValue(what, where="settings", hint="sweep it, or set it before the measurement")
-    return {name: to_parameter(name, value, None) for name, value in settings.items()}
 
 
 def _regions(given: Region | Sequence[Region] | None) -> Sequence[Region | None]:

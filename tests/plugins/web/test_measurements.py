@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,7 +12,7 @@ import pytest
 
 from afspm.basics import ExperimentClock
 from afspm.client import BEGUN_WITHIN_S, ScanTarget
-from afspm.model import ControlResponse, Frame, Region, Response, Scan, ScopeState, ScopeStatus
+from afspm.model import ControlResponse, Frame, Parameter, Region, Response, Scan, ScopeState, ScopeStatus
 from afspm.plugins.web.gateway.measurements import Measurement, Measurements
 from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest
 from afspm.plugins.web.person_commands import PersonCommands
@@ -26,17 +27,20 @@ NOT_FREE = Response(int(ControlResponse.NOT_FREE))
 
 
 class Commands:
-    """A scheduler with given answers that keeps the ids of its requests."""
+    """A scheduler with given answers that keeps the ids of its requests; `refusal` is its answer to settings."""
 
-    def __init__(self, *answers: Response) -> None:
+    def __init__(self, *answers: Response, refusal: Response | None = None) -> None:
         self.answers = list(answers)
+        self.refusal = refusal
         self.ids: list[str] = []
 
     def prepare_scan(self, region: object, shape: object) -> None:
         pass
 
-    def act_when_free(self, action: str, next_id: Callable[[], str]) -> Response:
+    def act_when_free(self, action: str, next_id: Callable[[], str], settings: tuple[Parameter, ...]) -> Response:
         while True:
+            if settings and self.refusal is not None:
+                return self.refusal
             self.ids.append(next_id())
             if (answer := self.answers.pop(0)).code != ControlResponse.NOT_FREE:
                 return answer
@@ -48,8 +52,8 @@ class Lab:
         self.watch = Watch(ExperimentClock.real())
         self.kept = Measurements(file, self.watch, lambda: self.now_s)
 
-    def begin(self, commands: Commands, key: str = "tile") -> Measurement:
-        return self.kept.take("gateway:ada", key, TARGET)(cast("PersonCommands", commands))
+    def begin(self, commands: Commands, key: str = "tile", target: ScanTarget = TARGET) -> Measurement:
+        return self.kept.take("gateway:ada", key, target)(cast("PersonCommands", commands))
 
     def found(self) -> Measurement:
         found = self.kept.find("gateway:ada", "tile")
@@ -139,6 +143,39 @@ def test_a_key_belongs_to_one_measurement_of_one_client(file: Path) -> None:
         lab.kept.take("gateway:ada", "tile", other)(cast("PersonCommands", Commands()))
     assert refused.value.model.code is RefusalCode.KEY_USED
     assert lab.kept.find("gateway:max", "tile") is None
+
+
+def at_bias(bias: str) -> ScanTarget:
+    return replace(TARGET, settings=(Parameter("tip-bias-voltage", bias, "V"),))
+
+
+def test_refused_setting_leaves_the_key_for_another_value(file: Path) -> None:
+    lab, commands = Lab(file), Commands(OK, refusal=Response(int(ControlResponse.PARAM_ERROR), reason="above 3 V"))
+    with pytest.raises(RefusedRequest) as refused:
+        lab.begin(commands, target=at_bias("4"))
+    assert refused.value.model.code is RefusalCode.PARAMETER_REFUSED
+    assert (lab.kept.find("gateway:ada", "tile"), commands.ids) == (None, [])
+    commands.refusal = None
+    assert lab.begin(commands, target=at_bias("2")).state == "running"
+
+
+def test_refused_setting_does_not_end_an_attempt_of_unknown_outcome(file: Path) -> None:
+    lab = Lab(file)
+    with pytest.raises(RefusedRequest):
+        lab.begin(Commands(SILENCE), target=at_bias("2"))
+    with pytest.raises(RefusedRequest):
+        lab.begin(Commands(refusal=NOT_IN_CONTROL), target=at_bias("2"))
+    lab.publish(ScopeState.SCANNING, scan(), ScopeState.FREE)
+    assert lab.found().state == "done"
+
+
+def test_settings_belong_to_a_measurement_also_after_a_restart(file: Path) -> None:
+    Lab(file).begin(Commands(OK), target=at_bias("2"))
+    lab = Lab(file)
+    assert lab.begin(Commands(), target=at_bias("2")).state == "running"
+    with pytest.raises(RefusedRequest) as refused:
+        lab.begin(Commands(), target=at_bias("1"))
+    assert refused.value.model.code is RefusalCode.KEY_USED
 
 
 def test_a_grid_of_several_thousand_keys_is_not_begun_again(file: Path) -> None:

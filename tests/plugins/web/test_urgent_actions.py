@@ -1,4 +1,4 @@
-"""An urgent action and a renewal do not wait behind an action that waits for a free microscope."""
+"""An action that waits for a free microscope lets urgent ones and renewals through, and states its settings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from deadlines import DEADLINE_S
 
 from afspm.basics import ExperimentClock, Launch
 from afspm.client import ExperimentLink
-from afspm.model import ControlResponse, Region, Response, ScanParameters, ScopeState, ScopeStatus, names
+from afspm.model import ControlResponse, Parameter, Region, Response, ScanParameters, ScopeState, ScopeStatus, names
 from afspm.plugins.web.person_commands import PersonCommands
 from afspm.plugins.web.persons import Persons
 from afspm.plugins.web.watch import Watch
@@ -22,6 +22,7 @@ class BusyMicroscope:
     def __init__(self) -> None:
         self.clock = ExperimentClock.real()
         self.asked: list[object] = []
+        self.busy = 1_000_000
 
     def pump(self, timeout_s: float) -> None:
         pass
@@ -31,9 +32,16 @@ class BusyMicroscope:
 
     def request(self, kind: int, subject: object = None, **_: object) -> Response:
         self.asked.append(subject)
-        if subject != names.START_SCAN:
+        if subject != names.START_SCAN or self.busy == 0:
             return Response(int(ControlResponse.SUCCESS))
+        self.busy -= 1
         return Response(int(ControlResponse.NOT_FREE))
+
+    def lend(self, settings: object, _: float) -> Response:
+        return self.request(0, settings)
+
+    def give_back(self, _: float) -> Response:
+        return self.request(0, "give back")
 
 
 @pytest.fixture
@@ -108,3 +116,17 @@ def test_renewal_is_carried_out_while_a_scan_waits_which_then_waits_on(persons: 
 def test_renewal_is_carried_out_where_nothing_waits(persons: Persons, link: BusyMicroscope) -> None:
     assert persons.submit("Ada", lambda one: one.renew(60.0), meanwhile=True).result(DEADLINE_S).ok
     assert link.asked == [60.0]
+
+
+def test_settings_are_stated_before_each_attempt_and_given_back_with_control(link: BusyMicroscope) -> None:
+    link.busy = 1
+    watch = Watch(link.clock)
+    watch.take("ScopeStateMsg", ScopeStatus(ScopeState.FREE), 1)
+    commands = PersonCommands(cast("ExperimentLink", link), watch)
+    bias = Parameter("tip-bias-voltage", "0.5", "V")
+    assert commands.act_when_free(names.START_SCAN, settings=(bias,)).ok
+    assert link.asked == [(bias,), names.START_SCAN] * 2
+    assert commands.act_when_free(names.START_SCAN).ok
+    assert link.asked[-2:] == [(), names.START_SCAN], "what an earlier scan has stated must not hold"
+    assert commands.release_control().ok
+    assert link.asked[-2:] == ["give back", None]

@@ -23,6 +23,7 @@ from deadlines import DEADLINE_S
 from tests.system.gateway.gateway_lab import EXPERIMENT, REGION, SERIES, Client, Event, GatewayRun
 
 import afspm
+from afspm.plugins.web.gateway.reading_routes import FRESH_S
 from afspm.plugins.web.gateway.stream import MOST_STREAMS
 from afspm.plugins.web.passwords import hashed
 
@@ -108,6 +109,49 @@ def test_a_night_by_http_alone_is_in_the_record_under_its_name(started: Started)
         keys = [entry.key for entry in record.journal if entry.key and entry.response == 0]
         assert keys == ["first", "curve"]
         assert {entry.who for entry in record.refusals} == {"gateway:ada"}
+
+
+WRONG_SETTINGS = [
+    ([], 422, "invalid"),
+    ({"no name": 1}, 422, "invalid"),
+    ({"tip-bias-voltage": None}, 422, "invalid"),
+    ({"tip-bias-voltage": "0.5 parsec"}, 409, "parameter-refused"),
+    ({"tip-bias-voltage": "4 V"}, 409, "parameter-refused"),
+    ({"scan-top-left-x": 0}, 409, "parameter-refused"),
+    ({"x-no-such": 1}, 404, "not-supported"),
+]
+
+
+def test_settings_hold_for_their_measurement_alone(started: Started) -> None:
+    run = started('\n[limits.actions.start-spec]\nevery = "1 h"\n')
+    ada = run.client("ada")
+
+    def measure(what: str, key: str, settings: dict[str, object] | None = None) -> None:
+        asked = {"region": REGION, "shape": [16, 16]} if what == "scans" else {}
+        ada.done("POST", f"/{what}", {**asked, "key": key, "settings": settings})
+        assert ada.until_measured(key)["state"] == "done"
+
+    ada.done("POST", "/control", {"lease_s": 60})
+    before = ada.get("/parameters/tip-bias-voltage")["value"]
+    for wrong, status, code in WRONG_SETTINGS:
+        refused = ada.ask("POST", "/scans", {"settings": wrong, "key": "low"})
+        assert (refused.status, refused.code) == (status, code), refused.body
+    measure("scans", "low", {"tip-bias-voltage": "0.5 V", "scan-speed": 4e-6})
+    assert ada.ask("POST", "/scans", {"settings": {"tip-bias-voltage": 0.6}, "key": "low"}).code == "key-used"
+    measure("scans", "base")
+    measure("spectra", "curve", {"tip-bias-voltage": 0.7})
+    assert ada.ask("POST", "/spectra", {"settings": {"tip-bias-voltage": 0.8}, "key": "soon"}).code == "too-soon"
+    measure("scans", "plain")  # what was stated for the refused curve holds no more
+    measure("scans", "last", {"tip-bias-voltage": 0.9})
+    ada.done("DELETE", "/control")
+    time.sleep(FRESH_S)
+    assert ada.get("/parameters/tip-bias-voltage")["value"] == pytest.approx(before)
+    ada.done("POST", "/end")
+    assert run.process.wait(DEADLINE_S) == 0
+    with afspm.open_run(run.folder) as record:
+        rows = (*record.scans, *record.spectra)
+        in_force = {row.key: next(one.begin for one in row.in_force if one.name == "tip-bias-voltage") for row in rows}
+    assert in_force == pytest.approx({"low": 0.5, "base": before, "curve": 0.7, "plain": before, "last": 0.9})
 
 
 LEASE_S = 10.0

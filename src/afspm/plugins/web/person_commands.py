@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 from afspm import wire
+from afspm.basics import NoResponse
 from afspm.client import FITS, ExperimentLink, Value, is_set, to_parameter
 from afspm.model import (
     LEASE_REQUEST,
@@ -54,6 +56,7 @@ class PersonCommands:
         self._watch = watch
         self._hurried = hurried
         self._meanwhile = deque[Callable[[], None]]() if meanwhile is None else meanwhile
+        self._lends = False
 
     # --- the experiment ---
 
@@ -66,6 +69,10 @@ class PersonCommands:
         return self._ask(LEASE_REQUEST, lease_s)
 
     def release_control(self) -> Response:
+        """Give back what the person's measurements have lent, and release control."""
+        if self._lends:
+            with suppress(NoResponse):  # the scheduler sets it back before others measure
+                self._link.give_back(self._link.until(ANSWER_S))
         return self._ask(ControlRequest.RELEASE_CTRL)
 
     def set_mode(self, mode: ControlMode) -> Response:
@@ -130,20 +137,24 @@ class PersonCommands:
         )
         return None
 
-    def act_when_free(self, action: str, next_id: Callable[[], str] = str) -> Response:
+    def act_when_free(
+        self, action: str, next_id: Callable[[], str] = str, settings: Sequence[Parameter] = ()
+    ) -> Response:
         """Request an action, and repeat the request while the microscope is busy, for `FREE_S` at most.
 
         The wait ends early for an urgent action of the same person, such as to stop the scan.
 
         Args:
-            next_id: returns the id of the next attempt; requests with the same id are executed once.
+            next_id: returns the id of the next attempt; requests with the same id are executed once. It is called once
+                the settings are in force.
+            settings: the settings of the measurement, stated before each attempt.
         """
         until_s = self._link.clock.monotonic_s() + FREE_S
         while True:
             self._wait_for(is_free, until_s)
             with self._watch.reading():
                 seen = self._watch.changes
-            response = self._ask(ControlRequest.ACTION, action, next_id())
+            response = self._lend(settings) or self._ask(ControlRequest.ACTION, action, next_id())
             is_over = self._hurried() or self._link.clock.monotonic_s() >= until_s
             if response.code != ControlResponse.NOT_FREE or is_over:
                 return response
@@ -163,6 +174,17 @@ class PersonCommands:
         return self._ask(kind, subject)
 
     # --- within ---
+
+    def _lend(self, settings: Sequence[Parameter]) -> Response | None:
+        # None: they are in force. Once something was lent, also without settings: what was stated for a measurement
+        # that did not begin must not hold for the next one.
+        if not settings and not self._lends:
+            return None
+        self._lends = True  # also an unanswered request may be carried out
+        self._link.pump(0.0)
+        response = self._link.lend(settings, self._link.until(ANSWER_S))
+        self._lends = response.code != ControlResponse.CMD_NOT_SUPPORTED  # by a scheduler of another make
+        return None if response.ok else response
 
     def _ask(self, kind: int, subject: object = None, request_id: str = "") -> Response:
         self._link.pump(0.0)  # processes changes of the connection since the last request

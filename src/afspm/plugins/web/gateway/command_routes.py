@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Path, Query
@@ -12,7 +13,7 @@ from starlette.requests import Request
 from starlette.responses import Response as HttpResponse
 
 from afspm.basics import AfspmError, Plain
-from afspm.client import ScanTarget, SpectrumTarget, Target, xy_of
+from afspm.client import ScanTarget, SpectrumTarget, Target, Value, to_settings, xy_of
 from afspm.model import WAIT_FOR_CONTROL, ControlMode, ControlState, Region, Response, names
 from afspm.plugins.web.gateway.measurements import Measurement
 from afspm.plugins.web.gateway.models import (
@@ -31,7 +32,7 @@ from afspm.plugins.web.gateway.models import (
     ScanAsked,
     SpectrumAsked,
 )
-from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest, refused
+from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest, of_error, refused
 from afspm.plugins.web.gateway.reading_routes import Parameter
 from afspm.plugins.web.gateway.services import GatewayServices
 from afspm.plugins.web.gateway.views import parameter_model
@@ -115,14 +116,14 @@ class CommandRoutes:
         region = None if given is None else Region(xy_of(given.center_m), xy_of(given.size_m), given.angle_rad)
         shape = None if wanted.shape is None else (wanted.shape[0], wanted.shape[1])
         target = ScanTarget.of(region, shape, self._services.frame)
-        return await self._measure(asked, answer, wanted.key, target)
+        return await self._measure(asked, answer, wanted.key, target, wanted.settings)
 
     async def take_spectrum(
         self, asked: Request, answer: HttpResponse, wanted: SpectrumAsked = _SPECTRUM
     ) -> MeasurementModel:
         """Begin a spectrum, in control. The answer comes once the microscope accepts it; then poll the measurement."""
         target = SpectrumTarget.of(wanted.position_m, None, self._services.frame)
-        return await self._measure(asked, answer, wanted.key, target)
+        return await self._measure(asked, answer, wanted.key, target, wanted.settings)
 
     async def measurement(self, asked: Request, key: Annotated[KEY, Path()], wait_s: Wait = 0.0) -> MeasurementModel:
         """Return a measurement of yours, at its end or when the waiting time is over."""
@@ -191,7 +192,20 @@ class CommandRoutes:
 
     # --- within ---
 
-    async def _measure(self, asked: Request, answer: HttpResponse, key: str | None, target: Target) -> MeasurementModel:
+    async def _measure(
+        self,
+        asked: Request,
+        answer: HttpResponse,
+        key: str | None,
+        target: Target,
+        settings: Mapping[str, Value] | None,
+    ) -> MeasurementModel:
+        try:
+            stated = to_settings(settings or {})
+        except AfspmError as error:
+            raise of_error(error) from error
+        # in one order: the members of a JSON object have none, and a key sent again must have the same settings
+        target = replace(target, settings=tuple(stated[name] for name in sorted(stated)))
         begin = self._services.measurements.take(self._services.who(asked), key, target)
         begun: Measurement = await self._services.do(asked, begin)
         answer.headers["Location"] = f"measurements/{begun.key}"  # relative: a proxy may serve this on another path

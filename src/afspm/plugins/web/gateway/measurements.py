@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from functools import partial
+from inspect import GEN_CREATED, getgeneratorstate
 from pathlib import Path
 
 from afspm import Memory
@@ -151,10 +152,13 @@ class Measurements:
         if refusal is not None:
             raise refused(refusal)
         one = known or Measurement(who, key, plan)
-        response = commands.act_when_free(target.action, partial(next, self._attempts(one)))
+        attempts = self._attempts(one)
+        response = commands.act_when_free(target.action, partial(next, attempts), target.settings)
+        if getgeneratorstate(attempts) == GEN_CREATED:  # a setting was refused: the key stays free for other values
+            raise refused(response)
         return self._begun(one, response)
 
-    def _attempts(self, one: Measurement) -> Iterator[str]:
+    def _attempts(self, one: Measurement) -> Generator[str]:
         # a caller takes the next id only after a refusal of the attempt before
         while True:
             yield self._next_attempt(one)

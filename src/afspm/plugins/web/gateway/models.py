@@ -42,6 +42,17 @@ KEY = Annotated[
     str, Field(pattern=r"^[A-Za-z0-9._-]{1,64}$", examples=["tile-3"], description="makes it happen once in this run")
 ]
 TIME = Annotated[str, Field(description="UTC, ISO 8601", examples=["2026-11-22T04:00:00.000000Z"])]
+PARAMETER = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
+VALUE = NUMBER | bool | Annotated[str, Field(min_length=1, max_length=100)]
+SETTINGS = Annotated[
+    dict[Annotated[str, Field(pattern=PARAMETER)], VALUE],
+    Field(
+        max_length=100,
+        description="values of parameters for this measurement alone: numbers in SI, or text with a unit",
+        examples=[{"tip-bias-voltage": "0.5 V"}],
+        json_schema_extra={"additionalProperties": False},
+    ),
+]
 
 
 class _Answer(BaseModel):
@@ -101,7 +112,7 @@ class ParameterChange(_Asked):
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"value": 0.5, "unit": "V"}, {"value": "500 mV"}]})
 
-    value: NUMBER | bool | Annotated[str, Field(min_length=1, max_length=100)]
+    value: VALUE
     unit: str | None = Field(default=None, min_length=1, max_length=30)
 
 
@@ -203,6 +214,7 @@ class ScanAsked(_Asked):
         json_schema_extra={
             "examples": [
                 {"region": {"center_m": [0, 0], "size_m": [1e-6, 1e-6]}, "shape": [64, 64], "key": "tile-3"},
+                {"settings": {"tip-bias-voltage": "0.5 V", "scan-speed": 2e-6}},
                 {},
             ]
         }
@@ -210,6 +222,7 @@ class ScanAsked(_Asked):
 
     region: RegionModel | None = None
     shape: PixelPair | None = Field(default=None, description="(rows, columns)")
+    settings: SETTINGS | None = None
     key: KEY | None = None
 
 
@@ -219,6 +232,7 @@ class SpectrumAsked(_Asked):
     model_config = ConfigDict(json_schema_extra={"examples": [{"position_m": [0, 0], "key": "iv-1"}, {}]})
 
     position_m: PlacePair | None = Field(default=None, description="(x, y) that the probe is moved to")
+    settings: SETTINGS | None = None
     key: KEY | None = None
 
 

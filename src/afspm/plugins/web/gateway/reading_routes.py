@@ -19,6 +19,7 @@ from afspm.model import Response as ModelResponse
 from afspm.night import ScanSummary, SpectrumSummary
 from afspm.plugins.web.gateway import views
 from afspm.plugins.web.gateway.models import (
+    PARAMETER,
     ActionModel,
     ArrayModel,
     EventKind,
@@ -43,7 +44,7 @@ _KNOWN = (*names.BASE_PARAMETERS, *names.EXTENSION_PARAMETERS)
 _LACKING = (ControlResponse.PARAM_NOT_SUPPORTED, ControlResponse.CMD_NOT_SUPPORTED)
 _ACTIONS = (*names.BASE_ACTIONS, *names.EXTENSION_ACTIONS)
 Which = Annotated[str, Path(pattern=r"^([0-9]{1,20}|newest)$", examples=[NEWEST], description="an id, or `newest`")]
-Parameter = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$", examples=["scan-speed"])]
+Parameter = Annotated[str, Path(pattern=PARAMETER, examples=["scan-speed"])]
 Limit = Annotated[int, Query(ge=1, le=500)]
 After = Annotated[str, Query(pattern=r"^[0-9]{1,19}$", description="only those newer than this id")]
 _VALUES: dict[int | str, dict[str, object]] = {
