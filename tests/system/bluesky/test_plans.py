@@ -17,6 +17,7 @@ import pytest
 from deadlines import DEADLINE_S
 
 import afspm
+from afspm.basics.errors import UnitError
 from afspm.model import ScopeState
 
 pytest.importorskip("ophyd_async", reason="Bluesky is not installed")
@@ -116,7 +117,8 @@ def test_a_setting_waits_for_control_as_a_scan_does(scope: Any, runs: Path) -> N
 
 def test_a_plan_that_is_aborted_stops_its_scan_and_gives_control_back(scope: Any, runs: Path) -> None:
     engine = RunEngine()
-    engine(bps.mv(scope.scan_speed, 2e-7))
+    engine(bps.mv(scope.scan_speed, 2e-7, scope.tip_bias_voltage, 0.25))
+    scope.scan.stage_sigs["tip-bias-voltage"] = "0.5 V"
     with afspm.connect(runs, name="watcher") as watcher:
         begun = threading.Thread(target=_pause_when_scanning, args=(engine, watcher))
         begun.start()
@@ -128,7 +130,44 @@ def test_a_plan_that_is_aborted_stops_its_scan_and_gives_control_back(scope: Any
         assert watcher.wait_until(lambda: watcher.state is ScopeState.FREE, timeout_s=DEADLINE_S)
         with watcher.control(timeout_s=DEADLINE_S):
             assert watcher.in_control
+        assert watcher.get("tip-bias-voltage") == pytest.approx(0.25)
     engine(bps.mv(scope.tip_bias_voltage, 0.3))  # and the next plan works
+
+
+def test_staged_settings_hold_for_the_scans_of_the_plan(scope: Any, runs: Path) -> None:
+    documents: list[tuple[str, dict[str, Any]]] = []
+    engine = RunEngine()
+    engine(bps.mv(scope.tip_bias_voltage, 0.25))
+    scope.scan.stage_sigs |= {"tip-bias-voltage": "0.5 V", "scan-speed": 2e-5}
+    plan = bp.scan([scope.scan, scope.spectrum], scope.scan.center_x, -1e-6, 1e-6, 2)
+    engine(plan, lambda *one: documents.append(one))
+    (descriptor,) = [document for name, document in documents if name == "descriptor"]
+    shown = descriptor["configuration"]["scope-scan"]
+    assert shown["data"] == {
+        "scope-scan-rows": 32, "scope-scan-columns": 32,
+        "scope-scan-tip_bias_voltage": 0.5, "scope-scan-scan_speed": 2e-5,
+    }  # fmt: skip
+    assert shown["data_keys"]["scope-scan-tip_bias_voltage"]["units"] == "V"
+    assert list(descriptor["configuration"]["scope-spectrum"]["data"]) == ["scope-spectrum-kind"]
+    for name, document in documents:
+        schema_validators[DocumentNames[name]].validate(_plain(document))
+    with afspm.connect(runs, name="watcher") as watcher:
+        assert watcher.get("tip-bias-voltage") == pytest.approx(0.25)
+    (folder,) = runs.glob("night-*")
+    with afspm.open_run(folder) as record:
+        assert [_bias(row) for row in record.scans] == [0.5, 0.5]
+        assert [_bias(row) for row in record.spectra] == [0.25, 0.25]
+
+
+def _bias(row: Any) -> object:
+    return next(one.begin for one in row.in_force if one.name == "tip-bias-voltage")
+
+
+def test_wrong_staged_setting_fails_the_plan_before_its_first_scan(scope: Any) -> None:
+    scope.scan.stage_sigs["tip-bias-voltage"] = "0.5 parsec"
+    with pytest.raises(FailedStatus) as failed:
+        RunEngine()(bp.count([scope.scan]))
+    assert isinstance(failed.value.__cause__, UnitError)
 
 
 def _pause_when_scanning(engine: RunEngine, watcher: afspm.Scope) -> None:

@@ -6,14 +6,18 @@
     RE(bp.scan([scope.scan], scope.scan.center_x, -1e-6, 1e-6, 5))
 
 The scheduler treats a plan like a notebook: the plan waits for control, limits hold, tip repairs come first. A
-plan keeps control while the microscope is staged. An aborted plan stops its measurement.
+plan keeps control while the microscope is staged. An aborted plan stops its measurement. A device has `stage_sigs`, the
+settings that its measurements carry:
+
+    scope.scan.stage_sigs["tip-bias-voltage"] = "0.5 V"
 """
 
 from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import partial
@@ -25,7 +29,7 @@ from numpy.typing import NDArray
 
 from afspm import Scope, connect
 from afspm.basics import NS_PER_S, imports_of_extra
-from afspm.client import Value
+from afspm.client import Value, from_parameter, to_settings
 from afspm.model import Region, names
 from afspm.record import field_names
 
@@ -129,10 +133,17 @@ class _ParameterBackend(SignalBackend[float]):
 
 
 class _Measurement(StandardReadable, Triggerable):
-    """A measurement at the position in its signals, with an array for each channel or variable."""
+    """A measurement at the position in its signals, with an array for each channel or variable.
+
+    Attributes:
+        stage_sigs: values by parameter, as numbers in SI or text with a unit. From `stage` to `unstage` each
+            measurement carries them as its settings.
+    """
 
     def __init__(self, session: _PlanSession, name: str = "") -> None:
         self._session = session
+        self.stage_sigs: OrderedDict[str, Value] = OrderedDict()
+        self._staged: dict[str, Value] = {}
         self._keys: dict[str, DataKey] = {}
         self._readings: dict[str, Reading[Any]] = {}
         super().__init__(name)
@@ -144,6 +155,37 @@ class _Measurement(StandardReadable, Triggerable):
     async def read(self) -> dict[str, Reading[Any]]:
         readings: dict[str, Reading[Any]] = await super().read()
         return readings | {f"{self.name}-{field}": reading for field, reading in self._readings.items()}
+
+    @AsyncStatus.wrap
+    async def stage(self) -> None:
+        """Begin to measure with the settings in `stage_sigs`. Raises InvalidValue or UnitError for a wrong value."""
+        for parameter in to_settings(self.stage_sigs).values():
+            from_parameter(parameter, None)  # raises for a wrong unit, before anything is measured
+        self._staged = dict(self.stage_sigs)
+
+    @AsyncStatus.wrap
+    async def unstage(self) -> None:
+        """Give back what the measurements have lent: the scheduler sets the values of before."""
+        staged, self._staged = self._staged, {}
+        if staged:
+            await self._session.call(partial(_give_back, staged))
+
+    async def describe_configuration(self) -> dict[str, DataKey]:
+        described: dict[str, DataKey] = await super().describe_configuration()
+        return described | {key: described_as for key, described_as, _ in self._settings()}
+
+    async def read_configuration(self) -> dict[str, Reading[Any]]:
+        readings: dict[str, Reading[Any]] = await super().read_configuration()
+        return readings | {key: reading for key, _, reading in self._settings()}
+
+    def _settings(self) -> Iterator[tuple[str, DataKey, Reading[Value]]]:
+        # the staged settings alone: the documents show what the measurements carry
+        for name, parameter in to_settings(self._staged).items():
+            value, unit = from_parameter(parameter, None), names.BASE_PARAMETERS.get(name) or parameter.unit or ""
+            key = DataKey(source=f"{self._session.source}/{name}", dtype="number", shape=[], units=unit)
+            if not isinstance(value, float):
+                key["dtype"] = "string" if isinstance(value, str) else "boolean"
+            yield f"{self.name}-{name.replace('-', '_')}", key, _timed(value)
 
     async def _measured(self, ask: Callable[[Scope], T]) -> T | None:
         # None: the plan was aborted, and the measurement stopped
@@ -195,7 +237,7 @@ class ScanDevice(_Measurement):
         x, y, width, height, angle = [await signal.get_value() for signal in signals]
         shape = (await self.rows.get_value(), await self.columns.get_value())
         region = Region((x, y), (width, height), angle)
-        scans = await self._measured(lambda scope: scope.scan(region, shape=shape))
+        scans = await self._measured(lambda scope: scope.scan(region, shape=shape, settings=self._staged))
         if scans is None:
             return
         taken = list(scans.values())
@@ -217,7 +259,7 @@ class SpectrumDevice(_Measurement):
     @AsyncStatus.wrap
     async def trigger(self) -> None:
         at, kind = (await self.x.get_value(), await self.y.get_value()), await self.kind.get_value()
-        taken = await self._measured(lambda scope: scope.spectrum(at, kind=kind or None))
+        taken = await self._measured(lambda scope: scope.spectrum(at, kind=kind or None, settings=self._staged))
         if taken is None:
             return
         self._keep(taken.names, taken.units, list(taken.values.T), (taken.time_ns or 0) / NS_PER_S)
@@ -252,14 +294,26 @@ class Microscope(StandardReadable):
 
     @AsyncStatus.wrap
     async def stage(self) -> None:
-        """Wait for control, which is then kept until `unstage`."""
+        """Stage the devices, and wait for control, which is then kept until `unstage`."""
+        await self.scan.stage()  # a plan stages the root of its devices alone
+        await self.spectrum.stage()
         await self._session.call(lambda scope: self._held.enter_context(scope.control()))
 
     @AsyncStatus.wrap
     async def unstage(self) -> None:
-        """Stop the present measurement, and release control."""
+        """Stop the present measurement, give its settings back, and release control."""
         self._session.interrupt()
-        await self._session.call(lambda _: self._held.close())
+        try:
+            await self.scan.unstage()
+            await self.spectrum.unstage()
+        finally:
+            await self._session.call(lambda _: self._held.close())
+
+
+def _give_back(settings: Mapping[str, Value], scope: Scope) -> None:
+    # the end of a block gives back; nothing is set at its begin
+    with scope.settings(settings):
+        pass
 
 
 def _timed(value: T) -> Reading[T]:
