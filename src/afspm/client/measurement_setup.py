@@ -52,6 +52,7 @@ class MeasurementSetup:
         self._targets = targets
         self._withdrawal = withdrawal
         self.holds_z = False
+        self._is_shown = False
         self._rounded: tuple[ScanParameters, ScanParameters | None] | None = None
 
     def reach(self, target: Target, until_s: float | None) -> tuple[Parameter, ...]:
@@ -92,9 +93,11 @@ class MeasurementSetup:
                 self.move_probe(target.at_m, until_s)
         swept = () if target.point is None else tuple(one.name for one in target.settings)
         in_force = self.lend(target.lent, target.settings, until_s, target.settle_s, swept)
-        if target.settings:
+        # without a key the record takes them as those of all later measurements: the next one withdraws them
+        if target.settings or self._is_shown:
             shown = (in_force[one.name] for one in target.settings if one.name in in_force)
             self._commands.publish_settings((*reached, *shown), key, target.point)
+            self._is_shown = bool(target.settings) and not key
 
     def lend(
         self,

@@ -555,6 +555,16 @@ def test_blocks_hold_together_and_the_inner_one_comes_first() -> None:
     assert returned == [("tip-bias-voltage", "zctrl-igain")], "what an outer block states is not given back"
 
 
+def test_measurement_without_settings_withdraws_those_of_the_one_before_from_the_record() -> None:
+    lab = SweepLab()
+    scope = scope_of(lab)
+    scope.scan(shape=(8, 8), settings={"zctrl-igain": 4})
+    for _ in range(2):
+        scope.scan(shape=(8, 8))
+    messages = [wire.decode(one.message, one.payload) for one in lab.told("MeasurementSettings")]
+    assert [tuple(p.value for p in one.parameters) for one in messages] == [("4",), ()]
+
+
 def test_setting_of_another_instrument_is_no_setting_of_a_measurement() -> None:
     with pytest.raises(InvalidValue, match=r"cryo\.temperature belongs to another instrument"):
         scope_of(SweepLab()).scan(settings={"cryo.temperature": "4 K"})
