@@ -41,7 +41,14 @@ from afspm.model import (
     TipStatus,
     request_name,
 )
-from afspm.model.requests import LEND_REQUEST, OTHER_RUN_RESPONSE, RETURN_REQUEST, Settings
+from afspm.model.requests import (
+    AS_PLANNED_REQUEST,
+    KEEP_REQUEST,
+    LEND_REQUEST,
+    OTHER_RUN_RESPONSE,
+    RETURN_REQUEST,
+    Settings,
+)
 from afspm.model.sessions import run_of
 from afspm.model.state import FeedbackUnits
 from afspm.transport import Port
@@ -469,6 +476,14 @@ class ExperimentLink:
     def give_back(self, until_s: float | None = None) -> Response:
         """Let the scheduler set back all that this client has lent. Raises as `request`."""
         return self.request(RETURN_REQUEST, Settings(), until_s=until_s)
+
+    def settle_plans(self, parameters: Sequence[str], *, keeps: bool, until_s: float | None = None) -> Response:
+        """Let plans measure with what a person has set in MANUAL, or as planned; without parameters, in all of them.
+
+        Returns the answer, even a refusal. Raises as `request`.
+        """
+        kind = KEEP_REQUEST if keeps else AS_PLANNED_REQUEST
+        return self.request(kind, Settings.of(*map(Parameter, parameters)), until_s=until_s)
 
     def send_only(self, kind: int, subject: object = None, request_id: str = "") -> None:
         """Send a request without waiting for the answer; without a connection the request is lost."""

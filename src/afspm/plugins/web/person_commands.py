@@ -88,6 +88,10 @@ class PersonCommands:
     def clear(self, problem: int) -> Response:
         return self._ask(ControlRequest.RMV_EXP_PRBLM, problem)
 
+    def settle_plan(self, parameter: str, *, keeps: bool) -> Response:
+        """Let plans measure with the value set in MANUAL, or with their own."""
+        return self._link.settle_plans([parameter], keeps=keeps, until_s=self._link.until(ANSWER_S))
+
     def restart(self, process: str) -> Response:
         return self._ask(RESTART_REQUEST, process)
 

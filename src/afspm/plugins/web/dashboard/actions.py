@@ -24,7 +24,6 @@ from afspm.model import (
     Response,
     names,
 )
-from afspm.model.requests import AS_PLANNED_REQUEST, KEEP_REQUEST, Settings
 from afspm.plugins.web.dashboard.access import Access, Visitor
 from afspm.plugins.web.person_commands import PersonCommands
 from afspm.plugins.web.persons import Persons
@@ -105,9 +104,8 @@ class Actions:
 
     def settle_plan(self, parameter: str, *, keeps: bool) -> ActionResult:
         """Let plans measure with the value that a person has set in MANUAL, or with the one that they state."""
-        kind, with_ = (KEEP_REQUEST, "the value that was set") if keeps else (AS_PLANNED_REQUEST, "their own value")
-        response = self._commands.request(kind, Settings.of(Parameter(parameter)))
-        return _result(response, f"Plans measure with {with_} of {parameter}")
+        value = "the value that was set" if keeps else "their own value"
+        return _result(self._commands.settle_plan(parameter, keeps=keeps), f"Plans measure with {value} of {parameter}")
 
     def scan_speed_m_s(self) -> float | None:
         """Return the scan speed in force; None if the microscope does not have it."""

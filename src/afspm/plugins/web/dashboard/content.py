@@ -23,7 +23,6 @@ from afspm.model import (
     Region,
     TipStatus,
 )
-from afspm.model.requests import Overruling
 from afspm.night import OVER, Overview, ScanSummary, Span, Timeline, instrument_curves
 from afspm.plugins.web.dashboard.charts import Chart, drift_chart
 from afspm.plugins.web.dashboard.flags import Flag, flags
@@ -59,6 +58,15 @@ class SlowContent:
 
 
 @dataclass(frozen=True)
+class NotAsPlanned:
+    """A value in the place of a plan's, as text; or one left in MANUAL, which the plan would set again."""
+
+    parameter: str
+    text: str
+    is_asked: bool
+
+
+@dataclass(frozen=True)
 class Content:
     """The content of the page at one time.
 
@@ -82,7 +90,7 @@ class Content:
     log: tuple[LogLine, ...] = ()
     is_manual: bool = False
     by_hand: str = ""
-    overruled: tuple[Overruling, ...] = ()
+    not_as_planned: tuple[NotAsPlanned, ...] = ()
     tip: TipStatus | None = None
     adjustable: tuple[str, ...] = ()
     set_ns: Mapping[str, int] = field(default_factory=dict)
@@ -155,7 +163,9 @@ class Contents:
                 log=tuple(overview.log),
                 is_manual=control is not None and control.mode is ControlMode.MANUAL,
                 by_hand=overview.by_hand,
-                overruled=overview.overruled,
+                not_as_planned=tuple(
+                    NotAsPlanned(one.planned.name, one.text, one.is_asked) for one in overview.overruled
+                ),
                 tip=overview.tip,
                 adjustable=self._adjustable,
                 set_ns=dict(overview.set_ns),

@@ -12,9 +12,8 @@ from nicegui import events, ui
 from afspm.basics import PlainMapping, time_of_day, typeset_position
 from afspm.drawing import tint_class
 from afspm.model import ControlMode, Region, TipStatus
-from afspm.model.requests import Overruling
 from afspm.plugins.web.dashboard.actions import Actions
-from afspm.plugins.web.dashboard.content import Content
+from afspm.plugins.web.dashboard.content import Content, NotAsPlanned
 from afspm.plugins.web.dashboard.flags import Flag
 from afspm.plugins.web.dashboard.page_parts import page_part
 from afspm.plugins.web.dashboard.parameter_form import ParameterForm
@@ -104,7 +103,7 @@ class SettingsBar:
         self._box.set_visibility(False)
 
     def show(self) -> None:
-        found, may = self._session.content.overruled, self._session.may_steer
+        found, may = self._session.content.not_as_planned, self._session.may_steer
         if (found, may) == self._shown:
             return
         self._shown = (found, may)
@@ -118,8 +117,8 @@ class SettingsBar:
                     if may:
                         button("Keep mine" if one.is_asked else "As planned", partial(self._settle, one))
 
-    def _settle(self, one: Overruling) -> None:
-        self._session.do(lambda a: a.settle_plan(one.planned.name, keeps=one.is_asked))
+    def _settle(self, one: NotAsPlanned) -> None:
+        self._session.do(lambda a: a.settle_plan(one.parameter, keeps=one.is_asked))
 
 
 def _by_hand_html(by_hand: str, remedy: str) -> str:
