@@ -34,6 +34,7 @@ SETTLES = frozenset(
 """The parameters after whose change the feedback needs time."""
 _NONE = LoansInForce()
 _LOCK_IN = frozenset((names.LOCK_IN_AMPLITUDE, names.LOCK_IN_FREQUENCY))  # it modulates during scans, too
+_LINE_RATE = 0.01  # relative: a new frame changes a speed behind which stands a line rate, by its rounding
 _ROUNDED = 1e-6  # relative: a reading in single precision is the value that was set
 
 
@@ -49,7 +50,6 @@ class Loan:
         is_over: whether it is set back as soon as possible.
         is_unsure: whether others may have changed the value since it was lent.
         is_watched: whether the run was AUTOMATED and in contact since: another value is then a person's.
-        is_carried: whether the value follows from another one that has changed since.
         why: why it could not be set back; empty: nothing is known against it.
     """
 
@@ -61,7 +61,6 @@ class Loan:
     is_over: bool = False
     is_unsure: bool = False
     is_watched: bool = True
-    is_carried: bool = False
     why: str = ""
 
     @property
@@ -141,14 +140,15 @@ class LoanBook:
             if (found := settings.get(loan.name)) is None:
                 continue
             there = next((one for one in (loan.value, loan.before) if one in found.known), None)
-            if there is None and loan.is_carried and loan.base not in found.known:
-                there = found.parameter
+            if there is None and loan.name == names.SCAN_SPEED and equal(loan.value, found.parameter, _LINE_RATE):
+                there = loan.value
             if there is not None:
-                sure = replace(loan, value=there, before=None, is_unsure=False, is_watched=True, is_carried=False)
+                sure = replace(loan, value=there, before=None, is_unsure=False, is_watched=True)
                 book = book if sure == loan else book._with(key, sure)
                 continue
             book = replace(book, loans=without(book.loans, key))
-            if loan.base not in found.known:
+            is_base = loan.name == names.SCAN_SPEED and equal(loan.base, found.parameter, _LINE_RATE)
+            if loan.base not in found.known and not is_base:
                 changed[key] = loan
         return book, changed
 
@@ -189,9 +189,7 @@ class LoanBook:
         return (
             self
             if loan is None
-            else self._with(
-                key, replace(loan, value=value, before=None, is_unsure=False, is_watched=True, is_carried=False)
-            )
+            else self._with(key, replace(loan, value=value, before=None, is_unsure=False, is_watched=True))
         )
 
     def gone(self, keys: Iterable[str]) -> LoanBook:
@@ -234,10 +232,10 @@ class LoanBook:
         }
         return self if loans == self.loans else replace(self, loans=loans)
 
-    def carried(self, name: str) -> LoanBook:
-        """Return the book when a value may have changed with another one, without a decision about it."""
-        carried = {key: replace(loan, is_carried=True) for key, loan in self.loans.items() if loan.name == name}
-        return replace(self, loans={**self.loans, **carried}) if carried else self
+    def unwatched(self, name: str) -> LoanBook:
+        """Return the book when a value may have changed without a decision about it."""
+        unwatched = {key: replace(loan, is_watched=False) for key, loan in self.loans.items() if loan.name == name}
+        return replace(self, loans={**self.loans, **unwatched}) if unwatched else self
 
     def used(self, now_ns: int) -> LoanBook:
         """Return the book after a request for settings: the microscope is idle since then."""
@@ -260,15 +258,15 @@ def may_be_lent(found: Setting) -> bool:
     return found.parameter.name in names.MAY_BE_LENT if found.is_lent is None else found.is_lent
 
 
-def equal(a: Parameter, b: Parameter) -> bool:
-    """Return whether two values are equal, for a translator that does not compare by itself."""
+def equal(a: Parameter, b: Parameter, within: float = _ROUNDED) -> bool:
+    """Return whether two values are equal within a part of them; one without a unit is in SI."""
     try:
         first, second = float(a.value or ""), float(b.value or "")
     except ValueError:
         return a.value == b.value
     if a.unit != b.unit:
         first, second = (float(in_si(x, one.unit)[0]) if one.unit else x for x, one in ((first, a), (second, b)))
-    return abs(first - second) <= _ROUNDED * max(abs(first), abs(second))
+    return abs(first - second) <= within * max(abs(first), abs(second))
 
 
 def _matters(name: str, action: str) -> bool:

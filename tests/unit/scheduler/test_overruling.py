@@ -319,6 +319,13 @@ def test_lend_under_the_name_of_the_samples_bias_is_answered_and_refused_under_i
     assert answer.ok, answer.reason
     (found,) = desk.codec.decode_packet("LentSettings", answer.payload).parameters
     assert (found.name, float(found.value), desk.panel[BIAS]) == (names.BIAS_OF_SAMPLE, 0.5, -0.5)
+    desk.panel[BIAS] = -0.7
+    point = Settings(
+        (Setting(Parameter(names.BIAS_OF_SAMPLE, "0.5", "V"), is_swept=True), Setting(Parameter(GAIN, "5")))
+    )
+    answer = desk.asked("a", LEND_REQUEST, point)
+    found = {one.name: one.value for one in desk.codec.decode_packet("LentSettings", answer.payload).parameters}
+    assert {name: float(value) for name, value in found.items()} == {names.BIAS_OF_SAMPLE: 0.5, GAIN: 5.0}
     assert "here sample-bias is -tip-bias-voltage" in desk.lends("a", sample_bias="3 V").reason
     desk.panel[names.SAMPLE_BIAS] = 0.2
     assert "is the whole voltage only while the second electrode is at 0 V" in desk.lends("a", sample_bias="1 V").reason
@@ -440,18 +447,21 @@ def test_plan_that_is_given_up_is_overruled_no_more() -> None:
     assert shown(desk) == []
 
 
-def test_frame_of_the_run_is_no_decision_about_a_speed_behind_which_stands_a_line_rate() -> None:
+def test_rounding_of_a_line_rate_and_another_width_are_no_decision_about_a_speed() -> None:
     desk = Desk()
     desk.measures("a", scan_speed="2 um/s")
-    desk.take_control("b")
-    desk.panel[names.SCAN_SIZE_X] = 1e-7
-    assert desk.asked("b", PARAM, Parameter(names.SCAN_SIZE_X, "2e-7", "m")).ok
-    desk.panel[SPEED] = 2.008e-6
+    desk.panel[SPEED] = 2.008e-6  # since a new frame has another rounding
     desk.measures("b", scan_speed="1 um/s")
     desk.measures("c")
     desk.measures("a", scan_speed="2 um/s")
     assert [one[SPEED] for one in desk.measured[1:]] == [1e-6, 1e-6, 2e-6]
-    assert overruled(desk) == []
+    assert "reads" not in desk.log()
+    desk.panel[names.SCAN_SIZE_X] = 1e-7
+    desk.panel[SPEED] = 5e-7
+    acts(desk, 1e-7, before=4e-7, name=names.SCAN_SIZE_X)
+    desk.measures("a", scan_speed="2 um/s")
+    assert (desk.measured[-1][SPEED], overruled(desk)) == (2e-6, [])
+    assert "500 nm/s is its base from now on" in desk.log()
 
 
 def test_each_of_the_values_of_a_survey_has_a_place_of_its_own() -> None:

@@ -111,7 +111,8 @@ def _take_act(draft: StateDraft, act: ActByHand) -> None:
     is_manual, control = draft.control.mode is ControlMode.MANUAL, draft.env.settings.control
     draft.others_may_have_acted(is_watched=not is_manual)
     if any(one.parameter == names.SCAN_SIZE_X for one in act.changes):
-        draft.loans = draft.loans.carried(names.SCAN_SPEED)
+        # behind the speed of some makers stands a line rate: another width is no decision about the speed
+        draft.loans = draft.loans.unwatched(names.SCAN_SPEED)
     draft.limits = draft.limits.seen(Parameter(one.parameter, one.after, one.unit or None) for one in act.changes)
     for one in act.changes:
         changed = Parameter(one.parameter, one.after, one.unit or None)

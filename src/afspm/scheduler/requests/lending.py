@@ -536,7 +536,8 @@ def _planned(
 def _answered(draft: StateDraft, job: ForwardedRequest, lending: Lending, asked: Setting) -> Setting:
     name = asked.parameter.name
     found, in_force = lending.compared.get(name), lending.now.get(name, asked.parameter)
-    shown = draft.env.settings.limits.bias.of_sample if job.request.alias else _same
+    is_renamed = job.request.alias and name == names.TIP_BIAS_VOLTAGE
+    shown = draft.env.settings.limits.bias.of_sample if is_renamed else _same
     if found is None or may_be_lent(found):
         return Setting(shown(in_force))
     # of a value that is not lent, the client learns the one before
@@ -602,8 +603,6 @@ def begun(draft: StateDraft, client: str) -> None:
 def decided(draft: StateDraft, job: ForwardedRequest, answered: Parameter | None) -> None:
     """Note what a client has set outside of a measurement: a base, and of a person or solver more than that."""
     kind, names_set = draft.limits.kind_of_curve, draft.limits.names_set_by(job.outgoing)
-    if names.SCAN_SIZE_X in names_set and names.SCAN_SPEED not in names_set:
-        draft.loans = draft.loans.carried(names.SCAN_SPEED)  # behind the speed of some makers is a line rate
     is_solver = bool(draft.control.solving) and job.client == draft.control.holder
     for asked in () if job.is_by_hand else _values_set(job.outgoing):
         is_answer = answered is not None and answered.name == asked.name and answered.value is not None

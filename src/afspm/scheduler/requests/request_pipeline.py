@@ -133,7 +133,10 @@ def _by_canonical_name(draft: StateDraft, event: RequestIn) -> tuple[RequestIn, 
         renamed = tuple(map(draft.env.settings.limits.bias.canonical, parameters))
     except InvalidValue as error:
         return event, error.what
-    subject = Settings.of(*renamed, settle_s=asked.settle_s) if isinstance(asked, Settings) else renamed[0]
+    subject: Settings | Parameter = renamed[0]
+    if isinstance(asked, Settings):
+        named = (replace(one, parameter=name) for one, name in zip(asked.settings, renamed, strict=True))
+        subject = replace(asked, settings=tuple(named))
     payload = draft.env.codec.encode(subject)
     return replace(event, request=replace(event.request, subject=subject, payload=payload, alias=alias)), ""
 
