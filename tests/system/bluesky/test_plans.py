@@ -164,7 +164,7 @@ def _bias(row: Any) -> object:
 
 
 def test_wrong_staged_setting_fails_the_plan_before_its_first_scan(scope: Any) -> None:
-    scope.scan.stage_sigs["tip-bias-voltage"] = "0.5 parsec"
+    scope.scan.stage_sigs["tip-bias-voltage"] = "0.5 nm"
     with pytest.raises(FailedStatus) as failed:
         RunEngine()(bp.count([scope.scan]))
     assert isinstance(failed.value.__cause__, UnitError)

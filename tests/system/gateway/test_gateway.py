@@ -115,7 +115,7 @@ WRONG_SETTINGS = [
     ([], 422, "invalid"),
     ({"no name": 1}, 422, "invalid"),
     ({"tip-bias-voltage": None}, 422, "invalid"),
-    ({"tip-bias-voltage": "0.5 parsec"}, 409, "parameter-refused"),
+    ({"tip-bias-voltage": "0.5 nm"}, 409, "parameter-refused"),
     ({"tip-bias-voltage": "4 V"}, 409, "parameter-refused"),
     ({"scan-top-left-x": 0}, 409, "parameter-refused"),
     ({"x-no-such": 1}, 404, "not-supported"),
