@@ -28,7 +28,7 @@ _MOST_STATED = 4  # values of one parameter, as of a survey with its zooms; a sc
 
 
 @dataclass(frozen=True)
-class Stated:
+class StatedValue:
     """A value that a component has stated, with the key of its loan."""
 
     key: str
@@ -72,7 +72,7 @@ class PlanBook:
         found: what the solver at work has set outside of its measurements, by key. Not saved.
     """
 
-    stated: Mapping[str, tuple[Stated, ...]] = field(default_factory=dict)
+    stated: Mapping[str, tuple[StatedValue, ...]] = field(default_factory=dict)
     rules: Mapping[str, tuple[Rule, ...]] = field(default_factory=dict)
     begun: tuple[Begun, ...] = ()
     solver_states: Mapping[str, Parameter] = field(default_factory=dict)
@@ -100,10 +100,10 @@ class PlanBook:
             others = [one for one in known if one not in same]
             of_key = [one for one in others if one.key == key]
             oldest = of_key[: max(0, len(of_key) - _MOST_STATED + 1)]
-            known = [*(one for one in others if one not in oldest), Stated(key, parameter)]
+            known = [*(one for one in others if one not in oldest), StatedValue(key, parameter)]
         if tuple(known) == before:
             return self
-        # what is stated no more, as by a script or after a resume with another file, is no plan
+        # a value stated no more, as by a script or after a resume with another file, is no plan
         rules = tuple(
             rule
             for rule in self.rules.get(lender, ())
@@ -149,7 +149,7 @@ class PlanBook:
                     notes += note
         return book, notes
 
-    def left(self, by_hand: Mapping[str, Parameter], kind: str) -> Iterator[tuple[Stated, Overruling]]:
+    def left(self, by_hand: Mapping[str, Parameter], kind: str) -> Iterator[tuple[StatedValue, Overruling]]:
         """Yield what would overrule plans if what was set in MANUAL were kept, with the value that is stated.
 
         Args:
@@ -163,7 +163,7 @@ class PlanBook:
                 if value is not None and one.key.partition(" ")[2] in ("", kind) and not equal(value, theirs):
                     yield one, Overruling(lender, theirs, value, "", is_asked=True)
 
-    def keeping(self, left: Collection[tuple[Stated, Overruling]], by: str) -> tuple[PlanBook, list[str]]:
+    def keeping(self, left: Collection[tuple[StatedValue, Overruling]], by: str) -> tuple[PlanBook, list[str]]:
         """Return the book after a person has kept what was set in MANUAL, with a sentence for each value."""
         book, notes = self, list[str]()
         for stated, one in left:
@@ -184,7 +184,7 @@ class PlanBook:
     # --- the solver of a problem ---
 
     def solving(self, stated: Mapping[str, Parameter]) -> PlanBook:
-        """Return the book after the solver at work has stated settings: first those that were found bad."""
+        """Return the book after the solver at work has stated settings: first the ones found bad."""
         return self if self.solver_states else replace(self, solver_states=stated)
 
     def finding(self, key: str, asked: Parameter, answered: Parameter) -> PlanBook:

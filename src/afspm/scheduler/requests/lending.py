@@ -47,7 +47,7 @@ from afspm.model.setting_order import widening_first
 from afspm.scheduler.control.descriptions import feedback_values
 from afspm.scheduler.events import RequestIn
 from afspm.scheduler.loans import SETTLES, Loan, LoanBook, equal, key_of, kind_of, may_be_lent
-from afspm.scheduler.overrulings import Stated
+from afspm.scheduler.overrulings import StatedValue
 from afspm.scheduler.publishing.event_log import SCHEDULER
 from afspm.scheduler.publishing.own_packets import publish
 from afspm.scheduler.requests import answers, approvals
@@ -572,7 +572,7 @@ def _asked(job: ForwardedRequest) -> tuple[Setting, ...]:
 
 
 def _stated(draft: StateDraft, job: ForwardedRequest, kind: str) -> tuple[Parameter, ...]:
-    # each with what takes its place: not that of a point of a sweep, and nothing that limits refuse by now
+    # each with what takes its place: no point of a sweep has one, nor does a value that limits refuse by now
     found = []
     for one in _asked(job):
         value = draft.plans.instead(job.client, key_of(one.parameter.name, kind), one.parameter)
@@ -642,7 +642,7 @@ def _values_set(request: Request) -> tuple[Parameter, ...]:
     return feedback_values(subject) if isinstance(subject, Feedback) else ()
 
 
-def _left(draft: StateDraft) -> list[tuple[Stated, Overruling]]:
+def _left(draft: StateDraft) -> list[tuple[StatedValue, Overruling]]:
     if draft.control.mode is not ControlMode.MANUAL:
         return []
     left = draft.plans.left(draft.by_hand.left, draft.limits.kind_of_curve)
@@ -663,7 +663,7 @@ def refusal_to_overrule(draft: StateDraft, event: RequestIn) -> str:
         return "values are kept before the run continues: the mode is AUTOMATED"
     left = [(stated, one) for stated, one in _left(draft) if not given or stated.parameter.name in given]
     if not left:
-        return "no plan would set another value than those that were set in MANUAL"
+        return "no plan would set another value than was set in MANUAL"
     draft.plans, notes = draft.plans.keeping(left, who)
     _say(draft, notes)
     return ""
