@@ -71,7 +71,9 @@ def go_on(
     if tip_is_clear:
         with acting(where) as scope:
             scope.tip_is_clear()
-    if keep or as_planned:
+    if keep and not left:
+        typer.echo("no plan would set another value than was set in MANUAL: there is nothing to keep")
+    elif keep or as_planned:
         with acting(where) as scope:
             scope.keep_settings() if keep else scope.as_planned()
     _set_mode(where, ControlMode.AUTOMATED, "the experiment goes on (AUTOMATED)")
