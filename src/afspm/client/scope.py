@@ -56,7 +56,7 @@ from afspm.model import (
 from afspm.model.curve_request import CurveSettings, curve_parameters
 from afspm.model.events import HasTime
 from afspm.model.instruments import InstrumentOrders, is_of_instrument, newest_of
-from afspm.model.requests import AS_PLANNED_REQUEST, KEEP_REQUEST, RETURN_REQUEST, Settings
+from afspm.model.requests import AS_PLANNED_REQUEST, KEEP_REQUEST, Settings
 from afspm.model.sessions import KEYED
 from afspm.model.sweep_plan import SweepAxis, SweepOrder, SweepPlan, SweptValues
 from afspm.transport.process.parent import StopRequested
@@ -227,7 +227,7 @@ class Scope(ExperimentView):
             NoResponse: they are not set back within the timeout.
         """
         with self._call():
-            self._link.request(RETURN_REQUEST, Settings(), until_s=self._link.until(timeout_s))
+            self._link.give_back(self._link.until(timeout_s))
 
     def _carrying(self, target: TargetT, settings: Mapping[str, Value] | None = None) -> TargetT:
         own = (*target.settings, *to_settings(settings or {}).values())
@@ -722,7 +722,7 @@ class Scope(ExperimentView):
         this call it sets its own again.
 
         Raises:
-            Refused: the mode is not MANUAL, or this client is an agent.
+            Refused: the mode is not MANUAL, no plan would set another value, or this client is a component or agent.
         """
         self._ask_scheduler(KEEP_REQUEST, Settings.of(*map(Parameter, parameters)))
 
@@ -731,7 +731,7 @@ class Scope(ExperimentView):
         """Let plans measure with the values that they state, in spite of what a person or a solver has decided.
 
         Raises:
-            Refused: this client is an agent.
+            Refused: this client is a component or agent.
         """
         self._ask_scheduler(AS_PLANNED_REQUEST, Settings.of(*map(Parameter, parameters)))
 

@@ -62,8 +62,12 @@ class BiasReference:
         return self._renamed(given, names.TIP_BIAS_VOLTAGE)
 
     def of_sample(self, panel: Parameter) -> Parameter:
-        """Return a value of `tip-bias-voltage` as `sample-bias`. Raises InvalidValue if it is not a finite number."""
-        return self._renamed(panel, names.BIAS_OF_SAMPLE)
+        """Return a value of `tip-bias-voltage` as `sample-bias`, others as they are.
+
+        Raises:
+            InvalidValue: the value is not a finite number.
+        """
+        return panel if panel.name != names.TIP_BIAS_VOLTAGE else self._renamed(panel, names.BIAS_OF_SAMPLE)
 
     def _renamed(self, given: Parameter, name: str) -> Parameter:
         if given.value is None:

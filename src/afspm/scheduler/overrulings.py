@@ -125,7 +125,7 @@ class PlanBook:
             by: who decided, such as "by page:ada" or "at the microscope".
         """
         book, notes = self, list[str]()
-        planned = next((one.parameter for one in self.stated.get(lender, ())[::-1] if one.key == key), None)
+        planned = self._newest(lender, key)
         if planned is None:
             return self, notes
         for name, known in self.stated.items():
@@ -197,7 +197,7 @@ class PlanBook:
         """Return the book after a solver has cleared its problem, with a sentence for each value that it has found."""
         book, notes, bad = self.unsolved(), list[str](), self._found_bad()
         for key, found in self.found.items():
-            planned = next((one.parameter for one in self.stated.get(bad.lender, ())[::-1] if one.key == key), None)
+            planned = self._newest(bad.lender, key)
             base = bad.bases.get(key)
             if planned is None or base is None:
                 continue
@@ -231,6 +231,9 @@ class PlanBook:
         if lender not in self.stated:
             return self
         return replace(self, stated=without(self.stated, lender), rules=without(self.rules, lender))
+
+    def _newest(self, lender: str, key: str) -> Parameter | None:
+        return next((one.parameter for one in self.stated.get(lender, ())[::-1] if one.key == key), None)
 
     def _rule(self, lender: str, key: str, planned: Parameter) -> Rule | None:
         of_key = (rule for rule in self.rules.get(lender, ()) if rule.key == key)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from functools import partial
 
@@ -233,6 +234,10 @@ class StateDraft(StateParts):
 
     def log(self, level: str, text: str) -> None:
         self.effects.append(Log(level, text))
+
+    def warn(self, texts: Iterable[str]) -> None:
+        for text in texts:
+            self.log("WARNING", text)
 
     def send_forwards(self) -> None:
         if self.forwarder.outbox:

@@ -183,7 +183,9 @@ class HeldZ:
             raise
         except Exception as error:  # a driver may raise anything, and a tip without feedback must not be left so
             self._fail(found, str(error))
-            raise Refused(ControlResponse.PARAM_ERROR, f"the bias was set, and the tip withdrawn: {error}") from error
+            raise Refused(
+                ControlResponse.PARAM_ERROR, f"the feedback is off, with the tip withdrawn: {error}"
+            ) from error
         self.switched_on()
         self._forget("")
 

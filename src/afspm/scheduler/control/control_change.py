@@ -119,8 +119,7 @@ def _carry_out(draft: StateDraft, change: _Change) -> None:
     solved = before.problems.keys() - after.problems.keys()
     if before.solving in solved and change.ask.who == before.holder:
         draft.plans, notes = draft.plans.solved(change.ask.who)
-        for note in notes:
-            draft.log("WARNING", note)
+        draft.warn(notes)
     if before.holder != after.holder:
         draft.plans = draft.plans.unsolved()
         draft.loans = draft.loans.nothing_stated()

@@ -67,6 +67,9 @@ def _take_report(draft: StateDraft, supervisor: str, report: ProcessStates) -> N
     _replace_supervisors(draft, compared)
     if (holder := draft.control.holder) is not None:
         draft.lease = draft.lease.reported(compared.starts_of(component_of(holder)))
+    for name in draft.plans.stated:
+        if compared.over_since_s(component_of(name)) is not None:
+            draft.plans = draft.plans.ended(name)
     if warning:
         draft.log("WARNING", warning)
 

@@ -113,19 +113,19 @@ def _take_act(draft: StateDraft, act: ActByHand) -> None:
     if any(one.parameter == names.SCAN_SIZE_X for one in act.changes):
         # behind the speed of some makers stands a line rate: another width is no decision about the speed
         draft.loans = draft.loans.unwatched(names.SCAN_SPEED)
-    draft.limits = draft.limits.seen(Parameter(one.parameter, one.after, one.unit or None) for one in act.changes)
-    for one in act.changes:
-        changed = Parameter(one.parameter, one.after, one.unit or None)
-        draft.panel = draft.panel.with_change(one.parameter, draft.limits.outside(changed))
-        draft.limits = draft.limits.in_force(changed, draft.now_ns)
+    values = [Parameter(one.parameter, one.after, one.unit or None) for one in act.changes]
+    draft.limits = draft.limits.seen(values)
+    for value in values:
+        draft.panel = draft.panel.with_change(value.name, draft.limits.outside(value))
+        draft.limits = draft.limits.in_force(value, draft.now_ns)
     outside = [draft.panel.outside[one.parameter] for one in act.changes if one.parameter in draft.panel.outside]
     draft.event_log = draft.event_log.add(draft.now_s, panel_entry(draft.now_ns, TRANSLATOR, act, outside))
     pauses = draft.panel.asks_for_pause(act, stopped=control.stopped_by_hand, changed=control.changed_by_hand)
-    for one in act.changes:
+    for one, value in zip(act.changes, values, strict=True):
         if is_manual or pauses:  # what leads to MANUAL is set in it
             draft.by_hand = draft.by_hand.changed(one)
         else:
-            lending.turned(draft, Parameter(one.parameter, one.after, one.unit or None))
+            lending.turned(draft, value)
     if pauses:
         _give_to_person(draft, "; ".join([str(act), *outside]))
 

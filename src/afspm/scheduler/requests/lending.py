@@ -27,7 +27,6 @@ from afspm.model import (
     Request,
     Response,
     ResponseDetail,
-    component_of,
     names,
 )
 from afspm.model.microscope_status import STOPS
@@ -288,10 +287,10 @@ def _decided(draft: StateDraft, job: ForwardedRequest, turn: Turn, lending: Lend
     if changed and stated[: len(lending.stated)] != lending.stated:  # a person's value takes the place of a stated one
         _begin(draft, job, turn)
         return None
-    if second_electrode := answers.refusal_for_second_electrode(job.request, _values_of(compared)):
+    now = {name: one.parameter for name, one in compared.items()}
+    if second_electrode := answers.refusal_for_second_electrode(job.request, now):
         _refuse(draft, job, second_electrode)
         return None
-    now = {name: one.parameter for name, one in compared.items()}
     lending = replace(lending, compared=compared, now=now, stated=stated, kind=kind, way=())
     way = list[WayStep]()
     for one in stated:
@@ -350,12 +349,7 @@ def _found_changed(draft: StateDraft, key: str, loan: Loan, now: Parameter) -> N
     is_act = loan.is_watched and loan.before is None and draft.loans.is_compared
     if is_act and now.value is not None and not draft.limits.beyond_range(now):
         draft.plans, notes = draft.plans.decided(key, now, loan.lender, "at the microscope")
-        _say(draft, notes)
-
-
-def _say(draft: StateDraft, notes: list[str]) -> None:
-    for note in notes:
-        draft.log("WARNING", note)
+        draft.warn(notes)
 
 
 def _with_pair(
@@ -536,16 +530,13 @@ def _planned(
 def _answered(draft: StateDraft, job: ForwardedRequest, lending: Lending, asked: Setting) -> Setting:
     name = asked.parameter.name
     found, in_force = lending.compared.get(name), lending.now.get(name, asked.parameter)
-    is_renamed = job.request.alias and name == names.TIP_BIAS_VOLTAGE
-    shown = draft.env.settings.limits.bias.of_sample if is_renamed else _same
-    if found is None or may_be_lent(found):
-        return Setting(shown(in_force))
     # of a value that is not lent, the client learns the one before
-    return Setting(shown(in_force), (shown(found.parameter),), is_lent=False)
-
-
-def _same(parameter: Parameter) -> Parameter:
-    return parameter
+    shown: tuple[Parameter, ...] = (in_force,)
+    if found is not None and not may_be_lent(found):
+        shown = (in_force, found.parameter)
+    if job.request.alias:
+        shown = tuple(map(draft.env.settings.limits.bias.of_sample, shown))
+    return Setting(shown[0], shown[1:], is_lent=False if shown[1:] else None)
 
 
 def _try_again_later(draft: StateDraft) -> None:
@@ -581,10 +572,6 @@ def _stated(draft: StateDraft, job: ForwardedRequest, kind: str) -> tuple[Parame
     return tuple(found)
 
 
-def _values_of(compared: Mapping[str, Setting]) -> dict[str, Parameter | None]:
-    return {name: one.parameter for name, one in compared.items()}
-
-
 def _as_param(job: ForwardedRequest, parameter: Parameter) -> Request:
     return Request(int(ControlRequest.PARAM), parameter, id=job.request.id)
 
@@ -605,8 +592,7 @@ def decided(draft: StateDraft, job: ForwardedRequest, answered: Parameter | None
     kind, names_set = draft.limits.kind_of_curve, draft.limits.names_set_by(job.outgoing)
     is_solver = bool(draft.control.solving) and job.client == draft.control.holder
     for asked in () if job.is_by_hand else _values_set(job.outgoing):
-        is_answer = answered is not None and answered.name == asked.name and answered.value is not None
-        value = answered if answered is not None and is_answer else asked
+        value = asked if answered is None or answered.value is None or answered.name != asked.name else answered
         if is_solver:
             draft.plans = draft.plans.finding(key_of(asked.name, kind), asked, value)
         elif _is_person(draft, job.client):
@@ -627,7 +613,7 @@ def _overrule(draft: StateDraft, value: Parameter, by: str) -> None:
         draft.plans, notes = draft.plans.newer(key, value, by)
     else:
         draft.plans, notes = draft.plans.decided(key, value, loan.lender, by)
-    _say(draft, notes)
+    draft.warn(notes)
 
 
 def _is_person(draft: StateDraft, client: str) -> bool:
@@ -665,7 +651,7 @@ def refusal_to_overrule(draft: StateDraft, event: RequestIn) -> str:
     if not left:
         return "no plan would set another value than was set in MANUAL"
     draft.plans, notes = draft.plans.keeping(left, who)
-    _say(draft, notes)
+    draft.warn(notes)
     return ""
 
 
@@ -687,9 +673,6 @@ def may_return(draft: StateDraft) -> bool:
 
 def begin_returns(draft: StateDraft) -> None:
     """Queue a RETURN of the scheduler itself, once loans are over and may be set back."""
-    for lender in draft.plans.stated:
-        if draft.peers.supervisors.over_since_s(component_of(lender)) is not None:
-            draft.plans = draft.plans.ended(lender)
     book = draft.loans
     if not book.loans:
         return
@@ -742,8 +725,10 @@ def publish_changes(draft: StateDraft) -> None:
     if book.shown is not None and all(one is other for one, other in zip(now, then, strict=True)):
         return
     is_on_its_way = turn is not None and turn.lending is not None and not turn.lending.is_done
+    if is_on_its_way or draft.barrier.until_s is not None:
+        return
     shown = LoansInForce(book.in_force, (*draft.plans.in_force, *(one for _, one in _left(draft))))
-    if is_on_its_way or shown == book.shown or draft.barrier.until_s is not None:
+    if shown == book.shown:
         return
     draft.loans = replace(book, shown=shown)
     publish(draft, LOANS.name, draft.env.codec.encode(shown))
